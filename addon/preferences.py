@@ -4,6 +4,7 @@ import importlib.util
 import json
 import textwrap
 import time
+from pathlib import Path
 
 import bpy
 
@@ -52,6 +53,15 @@ def get(context: bpy.types.Context | None = None) -> LimberPreferences | None:
     return addon.preferences if addon else None
 
 
+def own_folder(name: str) -> Path:
+    """Return the folder of this name among the add-on's own; without an installed extension, a
+    temporary one."""
+    try:
+        return Path(bpy.utils.extension_path_user(KEY, path=name))
+    except ValueError:
+        return Path(bpy.app.tempdir, f"limber-{name}")
+
+
 def worker_command() -> list[str]:
     """Return how to start the worker; WorkerNotFound states what to do if there is none."""
     chosen = get()
@@ -63,11 +73,13 @@ def has_worker() -> bool:
     """Whether there is a worker, checked every few seconds only: panels ask at every redraw."""
     now = time.monotonic()
     if now - _looked.get("at", -_LOOK_AGAIN_SECONDS) >= _LOOK_AGAIN_SECONDS:
-        _looked["at"] = now
+        bundled = worker.bundled_command()
         try:
-            _looked["found"] = bool(worker_command())
+            command = worker_command()
         except worker.WorkerNotFound:
-            _looked["found"] = False
+            command = []
+        _looked.update(at=now, found=bool(command), lacks_robot=bool(command)
+                       and command == bundled and importlib.util.find_spec(_ROBOT_CLIENT) is None)
     return bool(_looked["found"])
 
 
@@ -77,9 +89,7 @@ def lacks_robot() -> bool:
     told = "" if chosen is None else _parts_of(chosen.worker_parts).get(_ROBOT_CLIENT, "")
     if told:
         return _lacks(told)
-    bundled = worker.bundled_command()
-    return has_worker() and bool(bundled) and worker_command() == bundled and (
-        importlib.util.find_spec(_ROBOT_CLIENT) is None)
+    return has_worker() and bool(_looked["lacks_robot"])
 
 
 def worker_trouble() -> str:
@@ -117,10 +127,5 @@ def _lacks(told: str) -> bool:
     return told.startswith("missing")
 
 
-def register() -> None:
-    _looked.clear()
-    bpy.utils.register_class(LimberPreferences)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LimberPreferences)
+CLASSES = (LimberPreferences,)
+register = _looked.clear

@@ -15,8 +15,6 @@ OPEN = "use_"
 """Prefix of the property that states whether an optional field is given."""
 _LARGEST_INTEGER = 2**31 - 1
 
-_registered: list[type] = []
-
 
 def _set_fruit_mass(settings: bpy.types.PropertyGroup, _context) -> None:
     """Set the mass of all hanging fruits to that of the slider."""
@@ -199,7 +197,7 @@ def differs(group: Any, stage: Stage, settings: dict[str, Any]) -> bool:
             if value != before and (value or before):
                 return True
         elif stage.fields[name].kind in ("number", "vector"):
-            if not np.array_equal(np.asarray(value, np.float32), np.asarray(before, np.float32)):
+            if np.float32(value).tolist() != np.float32(before).tolist():
                 return True
         elif _numbers(value) != _numbers(stage.fields[name].shown(before)):
             return True
@@ -352,25 +350,19 @@ def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dic
     group_of(scene, stage).outcome = json.dumps({"folder": folder, **kept})
 
 
-def _class(name: str, base: type, annotations: dict[str, Any]) -> type:
-    return type(name, (base,), {"__annotations__": annotations, "__module__": __name__})
+_GROUPS = {attribute_name(stage.name): type(
+    f"LIMBER_PG_{attribute_name(stage.name)}", (bpy.types.PropertyGroup,), {
+        "__module__": __name__, "__annotations__": stage_properties(stage) | {
+            "outcome": bpy.props.StringProperty(options={"HIDDEN"})}})
+    for stage in stages().values()}
+LimberSettings.__annotations__ |= {
+    name: bpy.props.PointerProperty(type=group) for name, group in _GROUPS.items()}
+CLASSES = (*_GROUPS.values(), LimberSettings)
 
 
 def register() -> None:
-    for stage in stages().values():
-        own = stage_properties(stage) | {"outcome": bpy.props.StringProperty(options={"HIDDEN"})}
-        group = _class(f"LIMBER_PG_{attribute_name(stage.name)}", bpy.types.PropertyGroup, own)
-        bpy.utils.register_class(group)
-        _registered.append(group)
-        LimberSettings.__annotations__[attribute_name(stage.name)] = bpy.props.PointerProperty(
-            type=group)
-    bpy.utils.register_class(LimberSettings)
-    _registered.append(LimberSettings)
     bpy.types.Scene.limber = bpy.props.PointerProperty(type=LimberSettings)
 
 
 def unregister() -> None:
-    if hasattr(bpy.types.Scene, "limber"):
-        del bpy.types.Scene.limber
-    while _registered:
-        bpy.utils.unregister_class(_registered.pop())
+    del bpy.types.Scene.limber

@@ -4,7 +4,6 @@ import time
 from pathlib import Path
 from typing import ClassVar
 
-import blf
 import bpy
 from bpy_extras import view3d_utils
 from mathutils import Vector
@@ -16,6 +15,7 @@ from ..bridge import animation, meshes
 from ..jobs.stages import stages
 from ..jobs.worker import WorkerNotFound
 from ..plan import goal_ball
+from ..show.view_borders import write
 from . import limits, live_loads, session
 from .carried_marks import CarriedMarks
 from .frame_rate import FrameRate
@@ -355,14 +355,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         scale = bpy.context.preferences.system.ui_scale
         if (place := self._held_at()) is not None:
             limits.draw_ring(place, self._reached[0].share if self._reached else None, scale)
-        blf.size(0, 14 * scale)
-        blf.enable(0, blf.SHADOW)
-        blf.shadow(0, 5, 0.0, 0.0, 0.0, 0.9)
-        blf.color(0, *colour)
-        for number, line in enumerate(lines):
-            blf.position(0, x + 18 * scale, y - 18 * scale * number, 0)
-            blf.draw(0, line)
-        blf.disable(0, blf.SHADOW)
+        write(lines, x + 18 * scale, y, 14 * scale, -18 * scale, colour)
 
     def _lines(self) -> tuple[list[str], tuple[float, float, float, float]]:
         if self._session is None or not self._session.hello:

@@ -16,24 +16,14 @@ class LIMBER_TOOL_grab(bpy.types.WorkSpaceTool):
         layout.prop(tool.operator_properties("limber.grab"), "radius")
 
 
-_shortcuts: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
+SHORTCUT = ({"name": "Object Mode"}, "limber.grab", "B", {})
 
 
 def register() -> None:
-    if bpy.app.background:
-        return
-    bpy.utils.register_tool(LIMBER_TOOL_grab, after={"builtin.transform"}, separator=True)
-    # Among the add-ons' shortcuts: the user's own have priority, and may change them.
-    keys = bpy.context.window_manager.keyconfigs.addon
-    if keys is not None:
-        keymap = keys.keymaps.new("Object Mode")
-        _shortcuts.append((keymap, keymap.keymap_items.new(
-            "limber.grab", "B", "PRESS", shift=True, alt=True)))
+    if not bpy.app.background:
+        bpy.utils.register_tool(LIMBER_TOOL_grab, after={"builtin.transform"}, separator=True)
 
 
 def unregister() -> None:
-    while _shortcuts:
-        keymap, item = _shortcuts.pop()
-        keymap.keymap_items.remove(item)
     if not bpy.app.background:
         bpy.utils.unregister_tool(LIMBER_TOOL_grab)

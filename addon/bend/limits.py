@@ -74,7 +74,7 @@ class Tint:
         if on:
             active = mesh.color_attributes.active_color
             self._before = active.name if active is not None else ""
-            meshes.set_colors(mesh, _TINT, np.tile((*_OVER_LINEAR, 1.0), (len(mesh.vertices), 1)))
+            meshes.set_one_color(mesh, _OVER_LINEAR, _TINT)
             return
         before, self._before = self._before, None
         mesh.color_attributes.remove(mesh.color_attributes[_TINT])

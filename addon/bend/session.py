@@ -1,16 +1,14 @@
 """A branch held by a process of the worker (``limber session``), which answers while it is bent.
 
-No bpy here. Threads only read the process's output into a queue; the owner of the session calls
-:meth:`Session.poll` from Blender's main thread. ``python -m limber.session.worker --help``
-describes the protocol. Frames come through a file that both have mapped.
+No bpy here. The owner of the session calls :meth:`Session.poll` from Blender's main thread.
+``python -m limber.session.worker --help`` describes the protocol. Frames come through a file that
+both have mapped.
 """
 
 import atexit
 import json
 import mmap
-import queue
 import subprocess
-import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,10 +116,7 @@ class Session:
         self._frames: FrameFile | None = None
         self._ids = 0
         self._said: deque[str] = deque(maxlen=20)
-        self._lines: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
         self._process = WorkerProcess(command)
-        for name, stream in (("out", self._process.stdout), ("err", self._process.stderr)):
-            threading.Thread(target=self._read, args=(name, stream), daemon=True).start()
         _open.append(self)
 
     @property
@@ -132,13 +127,11 @@ class Session:
         """Return the replies and errors since the last call; the other messages are stored."""
         told = []
         has_ended = self._process.poll() is not None
-        while not self._lines.empty():
-            name, line = self._lines.get()
-            event = _event(line) if name == "out" else None
-            if event is None:
-                self._said.append(line)
+        for event in self._process.told():
+            kind = event.get("event") if isinstance(event, dict) else None
+            if not isinstance(kind, str):
+                self._said.append(str(event))
                 continue
-            kind = event["event"]
             if kind == "hello":
                 self._begin(event)
             elif kind == "compiling":
@@ -226,20 +219,6 @@ class Session:
             # It has ended; the next poll states why.
             self.error = self.error or "The session has ended."
         return self._ids
-
-    def _read(self, name: str, stream) -> None:
-        with stream:
-            for line in stream:
-                self._lines.put((name, line.rstrip("\n")))
-
-
-def _event(line: str) -> dict[str, Any] | None:
-    try:
-        content = json.loads(line)
-    except (ValueError, RecursionError):
-        # Native libraries print lines of their own among the worker's.
-        return None
-    return content if isinstance(content, dict) and isinstance(content.get("event"), str) else None
 
 
 _open: list[Session] = []

@@ -183,7 +183,7 @@ def activate(scene: bpy.types.Scene, thing: bpy.types.Object | None) -> None:
     layer.objects.active = thing if thing is None or thing.name in layer.objects else None
 
 
-def remember(scene: bpy.types.Scene) -> None:
+def remember(scene: bpy.types.Scene, *_: object) -> None:
     """Keep the folder of the active object: it stays the current one when a lamp is selected."""
     path = _path_of_active(scene)
     if path and scene.get(FOLDER_KEY) != path:
@@ -220,7 +220,7 @@ def _shown_from(scene: bpy.types.Scene, path: str) -> bpy.types.Collection | Non
 
 
 def _is_same_folder(one: str, other: str) -> bool:
-    if not one or not other:
+    if one == other or not one or not other:
         return one == other
     return Path(bpy.path.abspath(one)) == Path(bpy.path.abspath(other))
 
@@ -269,3 +269,6 @@ def add_object(collection: bpy.types.Collection, name: str, data: bpy.types.ID,
         data.materials.clear()
         data.materials.append(material)
     return thing
+
+
+HANDLERS = (("depsgraph_update_post", remember),)

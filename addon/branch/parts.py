@@ -47,6 +47,8 @@ class ShownBranch:
     notes: list[str] = field(default_factory=list)
     before: dict[str, bpy.types.Object] = field(default_factory=dict)
     _given: list[bpy.types.Mesh] = field(default_factory=list)
+    _filled: dict[bpy.types.Mesh, bpy.types.Mesh] = field(default_factory=dict)
+    """Meshes in the scene, and what each was given: the user may share one between two objects."""
 
     def find(self, kind: str, part: str = "") -> bpy.types.Object | None:
         """Return an object of this branch that was there before; None without."""
@@ -95,7 +97,7 @@ class ShownBranch:
     def _change(self, thing: bpy.types.Object, kind: str, name: str, mesh: bpy.types.Mesh,
                 material: bpy.types.Material | None) -> None:
         animation.stand_still(thing)
-        if meshes.is_given(thing.data):
+        if meshes.is_given(thing.data) and self._filled.setdefault(thing.data, mesh) == mesh:
             maps = set(thing.data.uv_layers.keys()) - set(mesh.uv_layers.keys())
             is_other = not meshes.has_same_faces(thing.data, mesh)
             if is_other and (maps or thing.data.shape_keys):

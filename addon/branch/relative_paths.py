@@ -10,14 +10,12 @@ needed.
 from pathlib import Path
 
 import bpy
-from bpy.app.handlers import persistent
 
 from ..bridge import animation
 from .branches import FOLDER_KEY
 from .parts import release_copies
 
 
-@persistent
 def _before_saving(path: str, *_) -> None:
     if not path:
         # The startup file: it has no path of its own.
@@ -46,7 +44,6 @@ def _moved(value: str, folder: Path | None, start: Path | None = None) -> str:
     return path if folder is None else animation.relative_path(path, folder)
 
 
-@persistent
 def _after_import(context: "bpy.types.BlendImportContext", *_) -> None:
     here = Path(bpy.data.filepath).parent if bpy.data.filepath else None
     for item in context.import_items:
@@ -62,13 +59,4 @@ def _after_import(context: "bpy.types.BlendImportContext", *_) -> None:
             settings.reconstruct.cloud = _moved(settings.reconstruct.cloud, here, there)
 
 
-def register() -> None:
-    bpy.app.handlers.save_pre.append(_before_saving)
-    if hasattr(bpy.app.handlers, "blend_import_post"):
-        bpy.app.handlers.blend_import_post.append(_after_import)
-
-
-def unregister() -> None:
-    bpy.app.handlers.save_pre.remove(_before_saving)
-    if hasattr(bpy.app.handlers, "blend_import_post"):
-        bpy.app.handlers.blend_import_post.remove(_after_import)
+HANDLERS = (("save_pre", _before_saving), ("blend_import_post", _after_import))

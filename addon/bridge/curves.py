@@ -5,8 +5,7 @@ import numpy as np
 
 
 def new_tube(name: str, points: np.ndarray, radius: float) -> bpy.types.Mesh:
-    """Make a tube of ``radius`` [m] along ``points`` [m], shape [p, 3]: a mesh with colours.
-    """
+    """Make a tube of ``radius`` [m] along ``points`` [m], shape [p, 3]: a mesh with colours."""
     points = np.asarray(points, float)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise ValueError(f"{name}: points of shape {points.shape} do not form a curve")

@@ -31,6 +31,8 @@ def plain_material(name: str, color: tuple[float, float, float], *, alpha: float
     shader.inputs["Alpha"].default_value = alpha
     shader.inputs["Emission Color"].default_value = (*color, 1.0)
     shader.inputs["Emission Strength"].default_value = glow
+    # EEVEE draws it as noise otherwise.
+    material.surface_render_method = "BLENDED" if alpha < 1.0 else "DITHERED"
     material.diffuse_color = (*color, alpha)
     return material
 

@@ -11,7 +11,8 @@ GIVEN_KEY = "limber_given"
 """Key of a mesh of ours: a digest of its faces, and of each attribute that was given to it."""
 _FACES = "faces"
 _VALUES = {"FLOAT": ("value", np.float32, 1), "INT": ("value", np.int32, 1),
-           "FLOAT_VECTOR": ("vector", np.float32, 3), "FLOAT_COLOR": ("color", np.float32, 4)}
+           "FLOAT_VECTOR": ("vector", np.float32, 3), "FLOAT_COLOR": ("color", np.float32, 4),
+           "BYTE_COLOR": ("color_srgb", np.float32, 4)}
 """Property, type and length of an attribute's values, by its type."""
 
 
@@ -65,22 +66,12 @@ def _add_faces(mesh: bpy.types.Mesh, faces: np.ndarray, vertex_count: int) -> No
 
 def set_positions(mesh: bpy.types.Mesh, vertices: np.ndarray) -> None:
     """Write all vertex positions [m], shape [v, 3]; the attribute is 50 times as fast as co."""
-    values = np.ascontiguousarray(_checked(vertices, 3, "vertices"), np.float32)
-    if len(values) != len(mesh.vertices):
-        raise ValueError(f"{len(values)} positions for {len(mesh.vertices)} vertices")
-    attribute = mesh.attributes.get("position")
-    if attribute is None:
-        attribute = mesh.attributes.new("position", "FLOAT_VECTOR", "POINT")
-    attribute.data.foreach_set("vector", values.ravel())
-    mesh.update_tag()
+    set_values(mesh, "position", vertices, "FLOAT_VECTOR")
 
 
 def positions(mesh: bpy.types.Mesh) -> np.ndarray:
     """Return all vertex positions [m], float32, shape [v, 3]."""
-    values = np.empty(3 * len(mesh.vertices), np.float32)
-    if len(values):
-        mesh.attributes["position"].data.foreach_get("vector", values)
-    return values.reshape(-1, 3)
+    return values_of(mesh, "position") if len(mesh.vertices) else np.empty((0, 3), np.float32)
 
 
 def faces(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -90,58 +81,27 @@ def faces(mesh: bpy.types.Mesh) -> np.ndarray:
     return values.reshape(-1, 3)
 
 
-def set_scalars(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write one number per vertex as FLOAT attribute ``name``, in its real unit; shape [v]."""
-    values = _checked(values, None, name)
-    _attribute(mesh, name, "FLOAT", len(values)).data.foreach_set(
-        "value", np.ascontiguousarray(values, np.float32))
+def set_values(mesh: bpy.types.Mesh, name: str, values: np.ndarray, kind: str = "FLOAT") -> None:
+    """Write attribute ``name``: a number in its real unit per vertex, shape [v], or a row, [v, k].
+
+    Solid mode then shows it if it is a FLOAT_COLOR, which is linear; a BYTE_COLOR is sRGB.
+    """
+    part, number, length = _VALUES[kind]
+    values = _checked(values, None if length == 1 else length, name)
+    _attribute(mesh, name, kind, len(values)).data.foreach_set(
+        part, np.ascontiguousarray(values, number).ravel())
+    if kind == "FLOAT_COLOR":
+        mesh.color_attributes.active_color = mesh.color_attributes[name]
     mesh.update_tag()
 
 
-def scalars(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
-    """Return FLOAT attribute ``name``, shape [v]; KeyError if there is none."""
-    values = np.empty(len(mesh.vertices), np.float32)
-    mesh.attributes[name].data.foreach_get("value", values)
-    return values
-
-
-def set_integers(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write one integer per vertex as INT attribute ``name``; shape [v]."""
-    values = _checked(values, None, name)
-    _attribute(mesh, name, "INT", len(values)).data.foreach_set(
-        "value", np.ascontiguousarray(values, np.int32))
-    mesh.update_tag()
-
-
-def integers(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
-    """Return INT attribute ``name``, shape [v]; KeyError if there is none."""
-    values = np.empty(len(mesh.vertices), np.int32)
-    mesh.attributes[name].data.foreach_get("value", values)
-    return values
-
-
-def colors(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
-    """Return the linear colours of attribute ``name``, shape [v, 4]; KeyError if there is none."""
-    values = np.empty(4 * len(mesh.vertices), np.float32)
-    mesh.attributes[name].data.foreach_get("color", values)
-    return values.reshape(-1, 4)
-
-
-def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write a linear RGBA colour per vertex and make it the one that Solid mode shows; [v, 4]."""
-    values = _checked(values, 4, name)
-    _attribute(mesh, name, "FLOAT_COLOR", len(values)).data.foreach_set(
-        "color", np.ascontiguousarray(values, np.float32).ravel())
-    mesh.color_attributes.active_color = mesh.color_attributes[name]
-    mesh.update_tag()
-
-
-def set_screen_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write an sRGB colour with alpha per vertex, one byte per component; shape [v, 4]."""
-    values = _checked(values, 4, name)
-    _attribute(mesh, name, "BYTE_COLOR", len(values)).data.foreach_set(
-        "color_srgb", np.ascontiguousarray(values, np.float32).ravel())
-    mesh.update_tag()
+def values_of(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
+    """Return attribute ``name``, shape [v] or [v, k]; KeyError if there is none."""
+    attribute = mesh.attributes[name]
+    part, number, length = _VALUES[attribute.data_type]
+    values = np.empty(length * len(attribute.data), number)
+    attribute.data.foreach_get(part, values)
+    return values if length == 1 else values.reshape(-1, length)
 
 
 def shrink(mesh: bpy.types.Mesh, depth: float) -> None:
@@ -154,7 +114,7 @@ def shrink(mesh: bpy.types.Mesh, depth: float) -> None:
 def set_one_color(mesh: bpy.types.Mesh, color: tuple[float, float, float],
                   attribute: str = "color") -> None:
     """Give all vertices one linear colour: Solid mode then shows it beside coloured surfaces."""
-    set_colors(mesh, attribute, np.tile((*color, 1.0), (len(mesh.vertices), 1)))
+    set_values(mesh, attribute, np.tile((*color, 1.0), (len(mesh.vertices), 1)), "FLOAT_COLOR")
 
 
 def is_given(mesh: bpy.types.ID) -> bool:
@@ -188,7 +148,7 @@ def give(mesh: bpy.types.Mesh, new: bpy.types.Mesh, *, is_edited_kept: bool = Fa
                 mesh.attributes.remove(mesh.attributes[name])
         for name in now.keys() - {_FACES}:
             if before.get(name) != now[name] or name not in mesh.attributes:
-                _copy_attribute(mesh, new.attributes[name])
+                set_values(mesh, name, values_of(new, name), new.attributes[name].data_type)
         mesh.update()
     mesh[GIVEN_KEY] = now
 
@@ -249,22 +209,10 @@ def _faces_digest(mesh: bpy.types.Mesh) -> str:
 
 
 def _digests(mesh: bpy.types.Mesh) -> dict[str, str]:
-    found = {attribute.name: hashlib.sha256(_values(attribute).tobytes()).hexdigest()
+    found = {attribute.name: hashlib.sha256(values_of(mesh, attribute.name).tobytes()).hexdigest()
              for attribute in mesh.attributes
              if attribute.domain == "POINT" and attribute.data_type in _VALUES}
     return found | {_FACES: _faces_digest(mesh)}
-
-
-def _values(attribute: bpy.types.Attribute) -> np.ndarray:
-    name, kind, length = _VALUES[attribute.data_type]
-    values = np.empty(length * len(attribute.data), kind)
-    attribute.data.foreach_get(name, values)
-    return values
-
-
-def _copy_attribute(mesh: bpy.types.Mesh, source: bpy.types.Attribute) -> None:
-    _attribute(mesh, source.name, source.data_type, len(source.data)).data.foreach_set(
-        _VALUES[source.data_type][0], _values(source))
 
 
 def new_sphere(name: str, radius: float) -> bpy.types.Mesh:
@@ -308,7 +256,7 @@ def new_rectangle(name: str, width: float, height: float) -> bpy.types.Mesh:
     """
     corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]], float)
     mesh = new_mesh(name, corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    set_scalars(mesh, "height", np.array([0.0, 0.0, 1.0, 1.0]))
+    set_values(mesh, "height", np.array([0.0, 0.0, 1.0, 1.0]))
     return mesh
 
 

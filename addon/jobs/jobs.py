@@ -1,15 +1,11 @@
 """Runs the worker as a process: queues it, reads its progress, cancels it. No bpy here.
 
-Threads only read the process's output into a queue; whoever owns the job calls :meth:`Job.poll`
-from Blender's main thread.
+Whoever owns the job calls :meth:`Job.poll` from Blender's main thread.
 """
 
 import atexit
 import enum
-import json
-import queue
 import subprocess
-import threading
 import time
 from collections import deque
 from typing import Any
@@ -80,7 +76,6 @@ class Job:
         self.result: dict[str, Any] = {}
         self.error = ""
         self.log: deque[str] = deque(maxlen=40)
-        self._lines: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
         self._cancelled_at: float | None = None
         self._started_at = self._heard_at = self._worked_at = 0.0
         self._cpu_seconds = 0.0
@@ -91,11 +86,6 @@ class Job:
         self._process = WorkerProcess(self.command, LIMBER_PARENT_PIPE="stdin")
         self.state, self.message = JobState.RUNNING, "starting"
         self._started_at = self._heard_at = self._worked_at = time.monotonic()
-        self._readers = [
-            threading.Thread(target=self._read, args=(name, stream), daemon=True)
-            for name, stream in (("out", self._process.stdout), ("err", self._process.stderr))]
-        for reader in self._readers:
-            reader.start()
 
     @property
     def outcome(self) -> dict[str, Any]:
@@ -113,10 +103,6 @@ class Job:
         if self.state is not JobState.RUNNING:
             return self.state
         code = self._process.poll()
-        if code is not None:
-            for reader in self._readers:
-                # A grandchild may keep the pipe open; the relevant lines have been read by then.
-                reader.join(timeout=2.0)
         self._take_lines()
         if code is not None:
             self._process.stdin.close()
@@ -180,19 +166,11 @@ class Job:
         if self in _waiting:
             _waiting.remove(self)
 
-    def _read(self, name: str, stream) -> None:
-        # Closed at its end, whichever process still has it open.
-        with stream:
-            for line in stream:
-                self._lines.put((name, line.rstrip("\n")))
-
     def _take_lines(self) -> None:
-        while not self._lines.empty():
-            name, line = self._lines.get()
+        for content in self._process.told():
             self._heard_at = time.monotonic()
-            content = _json_object(line) if name == "out" else None
-            if content is None:
-                self.log.append(line)
+            if isinstance(content, str):
+                self.log.append(content)
             elif _is_fraction(content.get("progress")):
                 self._worked_at = self._heard_at
                 self.fraction = float(content.pop("progress"))
@@ -228,15 +206,6 @@ class Job:
 
 def _is_fraction(value: Any) -> bool:
     return isinstance(value, int | float) and 0.0 <= value <= 1.0
-
-
-def _json_object(line: str) -> dict[str, Any] | None:
-    try:
-        content = json.loads(line)
-    except (ValueError, RecursionError):
-        # Native libraries print lines of their own among the worker's.
-        return None
-    return content if isinstance(content, dict) else None
 
 
 _last: list[Job] = []

@@ -13,8 +13,6 @@ from .stages import SettingError, Stage, stages
 from .steps import FIRST
 from .worker_operator import WorkerOperator
 
-_registered: list[type] = []
-
 
 class StageOperator(WorkerOperator):
     """Mix-in: runs ``stage``; keyword arguments of the operator change the scene's settings."""
@@ -207,14 +205,5 @@ def _own_properties(stage: Stage) -> dict:
             properties.stage_properties(stage, {"SKIP_SAVE"}).items() if name not in hidden}
 
 
-def register() -> None:
-    for stage in stages().values():
-        if stage.step and stage.moves_robot != "always":
-            operator = stage_operator(stage.name)
-            bpy.utils.register_class(operator)
-            _registered.append(operator)
-
-
-def unregister() -> None:
-    while _registered:
-        bpy.utils.unregister_class(_registered.pop())
+CLASSES = tuple(stage_operator(stage.name) for stage in stages().values()
+                if stage.step and stage.moves_robot != "always")

@@ -7,7 +7,6 @@ timer looks at the jobs, and calls the operator again when its job has ended.
 from typing import Any, NamedTuple
 
 import bpy
-from bpy.app.handlers import persistent
 
 from .. import preferences
 from ..panels.lines import wrapped
@@ -154,7 +153,7 @@ class WorkerOperator:
 
 def _look() -> float | None:
     """Poll the jobs beside the interface; return the time to the next look [s], None: no more."""
-    redraw_sidebars(bpy.context)
+    redraw_sidebars()
     for one in [one for one in _beside
                 if one.job.poll() not in (jobs.JobState.WAITING, jobs.JobState.RUNNING)]:
         _beside.remove(one)
@@ -166,7 +165,6 @@ def _look() -> float | None:
     return _INTERVAL_SECONDS if _beside else None
 
 
-@persistent
 def leave_file(*_args: Any) -> None:
     """Another file is loaded: no worker continues unseen, and the next file shows no failure."""
     for one in _beside:
@@ -184,9 +182,9 @@ def _no_result(job: jobs.Job) -> str:
             f"{said or 'nothing'}")
 
 
-def redraw_sidebars(context: bpy.types.Context) -> None:
+def redraw_sidebars(*_: Any) -> None:
     """Redraw the panels, but not the view: a million points take their time."""
-    for window in context.window_manager.windows:
+    for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PREFERENCES":
                 area.tag_redraw()
@@ -194,12 +192,10 @@ def redraw_sidebars(context: bpy.types.Context) -> None:
                 next(region for region in area.regions if region.type == "UI").tag_redraw()
 
 
-def register() -> None:
-    bpy.app.handlers.load_pre.append(leave_file)
+HANDLERS = (("load_pre", leave_file),)
 
 
 def unregister() -> None:
-    bpy.app.handlers.load_pre.remove(leave_file)
     if bpy.app.timers.is_registered(_look):
         bpy.app.timers.unregister(_look)
     _beside.clear()

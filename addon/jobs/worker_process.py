@@ -1,13 +1,18 @@
 """The worker as a process: started without a console window, ended with its child processes.
 
+Threads only read its output into a queue, which its owner empties from Blender's main thread.
 On POSIX it leads a process group. On Windows it belongs to a job object, which also ends with
 Blender, however that ends. No bpy here.
 """
 
 import ctypes
+import json
 import os
+import queue
 import signal
 import subprocess
+import threading
+from collections.abc import Iterator
 from typing import Any
 
 from .worker import worker_environment
@@ -46,6 +51,27 @@ class WorkerProcess(subprocess.Popen):
             text=True, encoding="utf-8", errors="replace", env=worker_environment() | extra,
             start_new_session=_POSIX, creationflags=0 if _POSIX else _CREATE_NO_WINDOW)
         self._job = None if _POSIX else _job_object(_kernel(), self._handle)
+        self._lines: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
+        self._readers = [threading.Thread(target=self._read, args=given, daemon=True)
+                         for given in (("out", self.stdout), ("err", self.stderr))]
+        for reader in self._readers:
+            reader.start()
+
+    def told(self) -> Iterator[dict[str, Any] | str]:
+        """Yield what it has written since the last call: JSON objects, and other lines as text."""
+        if self.poll() is not None:
+            for reader in self._readers:
+                # A grandchild may keep the pipe open; the relevant lines have been read by then.
+                reader.join(timeout=2.0)
+        while not self._lines.empty():
+            name, line = self._lines.get()
+            yield (_object_in(line) if name == "out" else None) or line
+
+    def _read(self, name: str, stream) -> None:
+        # Closed at its end, whichever process still has it open.
+        with stream:
+            for line in stream:
+                self._lines.put((name, line.rstrip("\n")))
 
     def ask_to_end(self) -> None:
         """Let it cancel its work and end; safe to call after it has ended."""
@@ -72,6 +98,15 @@ class WorkerProcess(subprocess.Popen):
             os.killpg(self.pid, number)
         except ProcessLookupError:
             return
+
+
+def _object_in(line: str) -> dict[str, Any] | None:
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError):
+        # Native libraries print lines of their own among the worker's.
+        return None
+    return content if isinstance(content, dict) else None
 
 
 def _kernel() -> Any:

@@ -40,7 +40,8 @@ class LIMBER_OT_open_example(bpy.types.Operator):
     def execute(self, context):
         source = example_folder()
         try:
-            target = Path(bpy.path.abspath(self.directory)) if self.directory else _own_folder()
+            target = Path(bpy.path.abspath(self.directory)) if self.directory else (
+                preferences.own_folder("example"))
             branch = target / EXAMPLE
             if not (branch / "branch.json").is_file():
                 target.mkdir(parents=True, exist_ok=True)
@@ -113,14 +114,6 @@ def show_tab(screen: bpy.types.Screen) -> None:
         if area.type == "VIEW_3D":
             area.spaces.active.shading.color_type = "VERTEX"
             area.spaces.active.show_region_ui = True
-
-
-def _own_folder() -> Path:
-    try:
-        return Path(bpy.utils.extension_path_user(preferences.KEY, path="example", create=True))
-    except ValueError:
-        # Not installed as an extension: a script, or a checkout.
-        return Path(bpy.app.tempdir) / "limber-example"
 
 
 CLASSES = (LIMBER_OT_open_example, LIMBER_OT_workspace)

@@ -2,12 +2,8 @@
 
 import bpy
 
-from .. import properties
 from ..branch import branches
-from .steps import next_stage
-
-_KEY = {"type": "L", "value": "PRESS", "shift": True, "alt": True}
-_shortcuts: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
+from .steps import draw_next
 
 
 class LIMBER_MT_pie(bpy.types.Menu):
@@ -21,13 +17,8 @@ class LIMBER_MT_pie(bpy.types.Menu):
         pie = self.layout.menu_pie()
         pie.operator("limber.grab", icon="VIEW_PAN")
         pie.operator("limber.place_goal", icon="SPHERE")
-        following = next_stage(context.scene)
-        if following is None:
+        if not draw_next(pie, context.scene):
             pie.operator("limber.open_result", icon="FILE_FOLDER")
-        else:
-            button = pie.operator(f"limber.{properties.attribute_name(following.name)}",
-                                  text=f"Next: {following.label}", icon="FORWARD")
-            button.branch_uuid = branches.current_uuid(context.scene)
         pie.operator("limber.play", icon="PLAY")
         if branches.find_surface(context.scene) is None:
             pie.operator("limber.open_example", icon="PLAY")
@@ -37,20 +28,6 @@ class LIMBER_MT_pie(bpy.types.Menu):
         pie.operator("limber.set_up_picture", icon="IMAGE_DATA")
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_MT_pie)
-    keys = bpy.context.window_manager.keyconfigs.addon
-    if bpy.app.background or keys is None:
-        return
-    # Among the add-ons' shortcuts: the user's own have priority, and may change them.
-    keymap = keys.keymaps.new("3D View", space_type="VIEW_3D")
-    item = keymap.keymap_items.new("wm.call_menu_pie", **_KEY)
-    item.properties.name = LIMBER_MT_pie.bl_idname
-    _shortcuts.append((keymap, item))
-
-
-def unregister() -> None:
-    while _shortcuts:
-        keymap, item = _shortcuts.pop()
-        keymap.keymap_items.remove(item)
-    bpy.utils.unregister_class(LIMBER_MT_pie)
+CLASSES = (LIMBER_MT_pie,)
+SHORTCUT = ({"name": "3D View", "space_type": "VIEW_3D"}, "wm.call_menu_pie", "L",
+            {"name": LIMBER_MT_pie.bl_idname})

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import compat, preferences, properties
+from .. import compat, preferences
 from ..bend import live_loads
 from ..branch import branches
 from ..bridge.materials import WOOD
@@ -14,7 +14,7 @@ from . import guide
 from .comparing import draw_branches
 from .lines import draw_text
 from .sidebar import SidebarPanel
-from .steps import next_stage
+from .steps import draw_next
 
 _NO_GRAPH = {"young": "Estimate first", "energy": "Plan a path first",
              "force": "Estimate from a pull with forces first"}
@@ -38,12 +38,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         if surface is None and branches.branches(context.scene):
             draw_text(self.layout, context, "Not shown: press Open Result", "INFO")
         draw_branches(self.layout, context)
-        following = next_stage(context.scene)
-        if following is not None:
-            button = self.layout.operator(
-                f"limber.{properties.attribute_name(following.name)}",
-                text=f"Next: {following.label}", icon="FORWARD")
-            button.branch_uuid = branches.current_uuid(context.scene)
+        draw_next(self.layout, context.scene)
         if surface is not None:
             self.layout.prop(settings.scene, "plan", **compat.placeholder("the newest"))
             self.layout.prop(settings.scene, "motion", **compat.placeholder("of the plan"))

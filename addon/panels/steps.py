@@ -36,7 +36,6 @@ from .sidebar import SidebarPanel
 _FIRST_ORDER = 3
 _GRAPHS = {"estimate": "young", "plan": "energy"}
 """Graph that shows a stage's result."""
-_registered: list[type] = []
 
 
 class StepPanel(SidebarPanel):
@@ -174,6 +173,15 @@ def next_stage(scene: bpy.types.Scene) -> Stage | None:
         if state in (StepState.NOT_RUN, StepState.STALE, StepState.CHANGED):
             return stage
     return None
+
+
+def draw_next(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> bool:
+    """Draw the button of the next stage; returns whether there is one."""
+    following = next_stage(scene)
+    if following is not None:
+        layout.operator(f"limber.{properties.attribute_name(following.name)}", icon="FORWARD",
+                        text=f"Next: {following.label}").branch_uuid = branches.current_uuid(scene)
+    return following is not None
 
 
 def stress_share(scene: bpy.types.Scene) -> float:
@@ -339,16 +347,9 @@ def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: St
             draw_text(body, context, " ".join(texts))
 
 
-def register() -> None:
-    for number, step in enumerate(STEPS):
-        panel = type(f"LIMBER_PT_{step.name}", (StepPanel, bpy.types.Panel), {
-            "bl_idname": f"LIMBER_PT_{step.name}", "bl_label": step.title,
-            "bl_order": _FIRST_ORDER + number, "step": step, "__module__": __name__,
-            "bl_options": set() if step.name in ("scan", "skeleton") else {"DEFAULT_CLOSED"}})
-        bpy.utils.register_class(panel)
-        _registered.append(panel)
-
-
-def unregister() -> None:
-    while _registered:
-        bpy.utils.unregister_class(_registered.pop())
+CLASSES = tuple(
+    type(f"LIMBER_PT_{step.name}", (StepPanel, bpy.types.Panel), {
+        "bl_idname": f"LIMBER_PT_{step.name}", "bl_label": step.title,
+        "bl_order": _FIRST_ORDER + number, "step": step, "__module__": __name__,
+        "bl_options": set() if step.name in ("scan", "skeleton") else {"DEFAULT_CLOSED"}})
+    for number, step in enumerate(STEPS))

@@ -37,9 +37,9 @@ def add(shown: ShownBranch, data: SceneData) -> None:
     colours = data.arrays["energy_grid_color"].reshape(-1, 4)
     trusted = np.flatnonzero(colours[:, 3] > 0)
     mesh = meshes.new_mesh("Energy field", points[trusted])
-    meshes.set_integers(mesh, _PLACE, trusted)
-    meshes.set_scalars(mesh, "energy_j", energies.ravel()[trusted])
-    meshes.set_colors(mesh, "color", colours[trusted])
+    meshes.set_values(mesh, _PLACE, trusted, "INT")
+    meshes.set_values(mesh, "energy_j", energies.ravel()[trusted])
+    meshes.set_values(mesh, "color", colours[trusted], "FLOAT_COLOR")
     thing, is_new = shown.put("energy_field", "Energy field", mesh)
     thing[_GRID_KEY] = list(energies.shape)
     thing[_BOX_KEY] = [*about["low_m"], *about["high_m"]]
@@ -70,7 +70,7 @@ def colours_at(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
     """
     counts, (low, high) = np.array(thing[_GRID_KEY]), box(thing)
     colours = np.zeros((np.prod(counts), 4), np.float32)
-    colours[meshes.integers(thing.data, _PLACE)] = meshes.colors(thing.data, "color")
+    colours[meshes.values_of(thing.data, _PLACE)] = meshes.values_of(thing.data, "color")
     colours = colours.reshape(*counts, 4)
     place = (points - low) / (high - low) * (counts - 1)
     is_inside = ((place >= 0) & (place <= counts - 1)).all(axis=1)

@@ -13,7 +13,6 @@ from . import energy_field
 _LINES = 90
 """Lines each way of the net that is drawn."""
 _ALPHA = 0.75
-_handle: list = []
 
 
 def net(thing: bpy.types.Object, surface: bpy.types.Object, place: Vector, across: Vector,
@@ -70,11 +69,4 @@ def _draw() -> None:
     gpu.state.depth_test_set("NONE")
 
 
-def register() -> None:
-    if not bpy.app.background:
-        _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW"))
-
-
-def unregister() -> None:
-    while _handle:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
+DRAWN = (_draw, "POST_VIEW")

@@ -5,7 +5,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy.app.handlers import persistent
 from mathutils import Vector
 
 from ..branch import branches, parts
@@ -161,16 +160,10 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, str | int | float | bool) else list(value)
 
 
-@persistent
 def _changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if any(isinstance(update.id, bpy.types.Object) and update.is_updated_transform
            and _PLACE_KEY in update.id for update in depsgraph.updates):
         follow(scene)
 
 
-def register() -> None:
-    bpy.app.handlers.depsgraph_update_post.append(_changed)
-
-
-def unregister() -> None:
-    bpy.app.handlers.depsgraph_update_post.remove(_changed)
+HANDLERS = (("depsgraph_update_post", _changed),)

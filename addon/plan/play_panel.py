@@ -1,10 +1,10 @@
 """The motion along the path, with its energy."""
 
 import bpy
-from bpy.app.handlers import persistent
 
 from ..branch import branches
 from ..bridge import animation
+from ..jobs.worker_operator import redraw_sidebars
 from ..panels import guide
 from ..panels.sidebar import SidebarPanel
 
@@ -46,20 +46,6 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
             motion.animation = True
 
 
-@persistent
-def _redraw_sidebars(*_) -> None:
-    """Keep frame and energy current while playing: Blender redraws the view alone."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                next(region for region in area.regions if region.type == "UI").tag_redraw()
-
-
-def register() -> None:
-    bpy.utils.register_class(LIMBER_PT_play)
-    bpy.app.handlers.frame_change_post.append(_redraw_sidebars)
-
-
-def unregister() -> None:
-    bpy.app.handlers.frame_change_post.remove(_redraw_sidebars)
-    bpy.utils.unregister_class(LIMBER_PT_play)
+CLASSES = (LIMBER_PT_play,)
+# Frame and energy stay current while it plays: Blender redraws the view alone.
+HANDLERS = (("frame_change_post", redraw_sidebars),)

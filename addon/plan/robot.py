@@ -21,7 +21,6 @@ _WARNING = ("The robot will move. Clear its workspace, and keep a hand",
 _LOOK_SECONDS = 0.2
 _LOOK_AGAIN_SECONDS = 1.0
 _seen: dict[str, bool] = {}
-_registered: list[type] = []
 
 
 class MovesRobot(StageOperator):
@@ -193,18 +192,16 @@ def _look() -> float:
     folder = _folder(bpy.context)
     is_there = folder is not None and (folder / live_force.FILE).is_file()
     if is_there or _seen.get("there"):
-        redraw_sidebars(bpy.context)
+        redraw_sidebars()
     _seen["there"] = is_there
     return _LOOK_SECONDS if is_there else _LOOK_AGAIN_SECONDS
 
 
+CLASSES = (LIMBER_OT_arm, *(stage_operator(stage.name, MovesRobot)
+                            for stage in stages().values() if stage.moves_robot == "always"))
+
 
 def register() -> None:
-    for operator in (LIMBER_OT_arm, *(stage_operator(stage.name, MovesRobot)
-                                      for stage in stages().values()
-                                      if stage.moves_robot == "always")):
-        bpy.utils.register_class(operator)
-        _registered.append(operator)
     if not bpy.app.background:
         bpy.app.timers.register(_look, first_interval=_LOOK_AGAIN_SECONDS, persistent=True)
 
@@ -213,5 +210,3 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(_look):
         bpy.app.timers.unregister(_look)
     _seen.clear()
-    while _registered:
-        bpy.utils.unregister_class(_registered.pop())

@@ -3,7 +3,6 @@
 import bpy
 import gpu
 import numpy as np
-from bpy.app.handlers import persistent
 from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
@@ -16,7 +15,6 @@ COLOUR = "scan_color"
 _PLAIN = (0.55, 0.75, 0.95, 1.0)
 _SIZE = 3.0
 _batches: dict[tuple, gpu.types.GPUBatch] = {}
-_handle: list = []
 
 
 def _draw() -> None:
@@ -56,38 +54,19 @@ def _before_loose_vertices(projection: Matrix, view_distance: float) -> Matrix:
 
 def colours_of(mesh: bpy.types.Mesh) -> np.ndarray:
     """Return the sRGB colours of a scan's points, float32, shape [n, 4]."""
-    count = len(mesh.vertices)
-    attribute = mesh.attributes.get(COLOUR)
-    if attribute is None:
-        return np.tile(np.array(_PLAIN, np.float32), (count, 1))
-    values = np.empty(4 * count, np.float32)
-    attribute.data.foreach_get("color_srgb", values)
-    return values.reshape(-1, 4)
+    return meshes.values_of(mesh, COLOUR) if COLOUR in mesh.attributes else np.tile(
+        np.array(_PLAIN, np.float32), (len(mesh.vertices), 1))
 
 
-@persistent
 def _changed(_scene, depsgraph=None) -> None:
     if depsgraph is None or any(update.is_updated_geometry for update in depsgraph.updates):
         _batches.clear()
 
 
-@persistent
 def _renewed(*_) -> None:
     _batches.clear()
 
 
-def register() -> None:
-    bpy.app.handlers.depsgraph_update_post.append(_changed)
-    bpy.app.handlers.load_post.append(_renewed)
-    bpy.app.handlers.undo_post.append(_renewed)
-    if not bpy.app.background:
-        _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW"))
-
-
-def unregister() -> None:
-    while _handle:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
-    bpy.app.handlers.undo_post.remove(_renewed)
-    bpy.app.handlers.load_post.remove(_renewed)
-    bpy.app.handlers.depsgraph_update_post.remove(_changed)
-    _batches.clear()
+DRAWN = (_draw, "POST_VIEW")
+HANDLERS = (("depsgraph_update_post", _changed), ("load_post", _renewed), ("undo_post", _renewed))
+unregister = _batches.clear

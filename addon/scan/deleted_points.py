@@ -9,6 +9,7 @@ import numpy as np
 
 from .. import preferences
 from ..branch import branch_folder, branches
+from ..bridge import meshes
 from . import clouds
 
 _NUMBER = "limber_point"
@@ -20,8 +21,7 @@ _PLY = ("ply\nformat binary_little_endian 1.0\nelement vertex {count}\nproperty 
 def number_points(scan: bpy.types.Object) -> None:
     """Store in an imported scan which of the file's points each vertex is."""
     count = len(scan.data.vertices)
-    numbers = scan.data.attributes.new(_NUMBER, "INT", "POINT")
-    numbers.data.foreach_set("value", np.arange(count, dtype=np.int32))
+    meshes.set_values(scan.data, _NUMBER, np.arange(count), "INT")
     scan[_COUNT_KEY] = count
 
 
@@ -58,10 +58,7 @@ def _left(scan: bpy.types.Object) -> np.ndarray:
         shape = bmesh.from_edit_mesh(scan.data)
         layer = shape.verts.layers.int.get(_NUMBER)
         return np.array([vertex[layer] for vertex in shape.verts], np.int32)
-    numbers = scan.data.attributes[_NUMBER].data
-    left = np.empty(len(numbers), np.int32)
-    numbers.foreach_get("value", left)
-    return left
+    return meshes.values_of(scan.data, _NUMBER)
 
 
 def is_ours(path: str) -> bool:
@@ -70,8 +67,4 @@ def is_ours(path: str) -> bool:
 
 
 def _folder() -> Path:
-    try:
-        return Path(bpy.utils.extension_path_user(preferences.KEY, path="deleted_points"))
-    except ValueError:
-        # Not installed as an extension: a script, or a checkout.
-        return Path(bpy.app.tempdir, "deleted_points")
+    return preferences.own_folder("deleted_points")

@@ -1,6 +1,7 @@
 """Import a scan for viewing: from the tab, from File > Import, or dropped into a view."""
 
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 
 import bpy
@@ -28,7 +29,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{kind}" for kind in _KINDS),
                                           options={"HIDDEN"})
 
-    _reading: scans.Reading | None = None
+    _reading: Future[scans.Scan] | None = None
     _timer = None
     _is_from_user = False
 
@@ -47,7 +48,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         if not self._is_from_user:
             return self._show(context, lambda: scans.read_scan(path))
         # The interface stays usable while the points are read.
-        self._reading = scans.Reading(path)
+        self._reading = scans.reading(path)
         manager = context.window_manager
         self._timer = manager.event_timer_add(_INTERVAL_SECONDS, window=context.window)
         manager.modal_handler_add(self)
@@ -55,10 +56,10 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
-        if event.type != "TIMER" or not self._reading.is_done:
+        if event.type != "TIMER" or not self._reading.done():
             return {"PASS_THROUGH"}
         self.cancel(context)
-        return self._show(context, self._reading.scan)
+        return self._show(context, self._reading.result)
 
     def cancel(self, context):
         """Blender closes or loads another file: the points being read are not shown."""
@@ -76,7 +77,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
             scan = read()
             mesh = meshes.new_mesh(path.stem, scan.points)
             if scan.colours is not None:
-                meshes.set_screen_colors(mesh, COLOUR, scan.colours)
+                meshes.set_values(mesh, COLOUR, scan.colours, "BYTE_COLOR")
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -128,13 +129,12 @@ def _draw_menu(menu: bpy.types.Menu, _context) -> None:
     menu.layout.operator("limber.import_cloud", text="Plant Scan for Limber (.ply, .xyz)")
 
 
+CLASSES = (LIMBER_OT_import_cloud, LIMBER_FH_cloud)
+
+
 def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_import_cloud)
-    bpy.utils.register_class(LIMBER_FH_cloud)
     bpy.types.TOPBAR_MT_file_import.append(_draw_menu)
 
 
 def unregister() -> None:
     bpy.types.TOPBAR_MT_file_import.remove(_draw_menu)
-    bpy.utils.unregister_class(LIMBER_FH_cloud)
-    bpy.utils.unregister_class(LIMBER_OT_import_cloud)

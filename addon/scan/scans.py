@@ -3,7 +3,7 @@
 A million points take most of a second.
 """
 
-import threading
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,28 +49,9 @@ def read_scan(path: Path) -> Scan:
                 branch_folder.folder_for(path), colours, unit)
 
 
-class Reading:
-    """A scan being read by a thread; check ``is_done``, then ask for the scan."""
+_reader = ThreadPoolExecutor(1)
 
-    def __init__(self, path: Path):
-        self._found: Scan | None = None
-        self._error: ValueError | OSError | None = None
-        self._thread = threading.Thread(target=self._read, args=(path,), daemon=True)
-        self._thread.start()
 
-    @property
-    def is_done(self) -> bool:
-        return not self._thread.is_alive()
-
-    def scan(self) -> Scan:
-        """Return the scan, once it is done; raises the exception of reading it."""
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return self._found
-
-    def _read(self, path: Path) -> None:
-        try:
-            self._found = read_scan(path)
-        except (ValueError, OSError) as error:
-            self._error = error
+def reading(path: Path) -> Future[Scan]:
+    """Begin to read a scan; ask whether it is done, then for its result."""
+    return _reader.submit(read_scan, path)

@@ -26,7 +26,7 @@ def add_rods(shown: ShownBranch, data: SceneData) -> None:
     for key, about in (data.info.get("rods") or {}).items():
         mesh = meshes.new_mesh(about["title"], data.arrays[f"rods:{key}"],
                                data.arrays[f"rod_faces:{key}"])
-        meshes.set_colors(mesh, "color", data.arrays[f"rod_color:{key}"])
+        meshes.set_values(mesh, "color", data.arrays[f"rod_color:{key}"], "FLOAT_COLOR")
         thing, is_new = shown.put(f"rods:{key}", about["title"], mesh,
                                   materials.vertex_color_material(about["title"], "color"))
         thing[SCALE_KEY] = json.dumps(about["scale"])

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import bpy
-from bpy.app.handlers import persistent
 
 from ..branch.branches import FOLDER_KEY, FRAME_SCALAR_KEY, branch_of, info_of, token_of
 from ..bridge import animation, materials, meshes
@@ -71,8 +70,9 @@ def _write(surface: bpy.types.Object, frame: float) -> None:
     last = len(values.scalars[name]) - 1
     number = min(max(round(animation.cache_frame(surface, frame)), 0), last)
     palette = info_of(surface)["frame_scalars"][name]["colours"]
-    meshes.set_scalars(surface.data, _NOW, values.scalars[name][number])
-    meshes.set_colors(surface.data, f"{_NOW}_color", values.colours(name, palette, number))
+    meshes.set_values(surface.data, _NOW, values.scalars[name][number])
+    meshes.set_values(surface.data, f"{_NOW}_color", values.colours(name, palette, number),
+                      "FLOAT_COLOR")
 
 
 def _values_of(surface: bpy.types.Object) -> FrameValues | None:
@@ -87,25 +87,16 @@ def _values_of(surface: bpy.types.Object) -> FrameValues | None:
     return _kept[path]
 
 
-@persistent
 def _frame_changed(current: bpy.types.Scene, *_) -> None:
     for thing in current.objects:
         if FRAME_SCALAR_KEY in thing and thing.type == "MESH":
             _write(thing, current.frame_current_final)
 
 
-@persistent
 def _forget(*_) -> None:
     """Another file may have another folder at the same path, or the cache has changed."""
     _kept.clear()
 
 
-def register() -> None:
-    bpy.app.handlers.frame_change_pre.append(_frame_changed)
-    bpy.app.handlers.load_post.append(_forget)
-
-
-def unregister() -> None:
-    bpy.app.handlers.load_post.remove(_forget)
-    bpy.app.handlers.frame_change_pre.remove(_frame_changed)
-    _kept.clear()
+HANDLERS = (("frame_change_pre", _frame_changed), ("load_post", _forget))
+unregister = _kept.clear

@@ -21,7 +21,6 @@ _LEFT, _BELOW, _ABOVE, _RIGHT = 62, 38, 42, 14
 _MARGIN, _TEXT, _DOT = 18, 11, 3.0
 _PAPER, _INK, _GRID = (0.09, 0.09, 0.10, 0.88), (0.92, 0.92, 0.92, 1.0), (1.0, 1.0, 1.0, 0.14)
 _CURSOR = (1.0, 1.0, 1.0, 0.6)
-_handle: list = []
 
 
 def graphs_of(surface: bpy.types.Object | None) -> dict:
@@ -139,11 +138,4 @@ def cursor_of(name: str, surface: bpy.types.Object, scene: bpy.types.Scene) -> f
     return places[min(max(number, 0), len(places) - 1)]
 
 
-def register() -> None:
-    if not bpy.app.background:
-        _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
-
-
-def unregister() -> None:
-    while _handle:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
+DRAWN = (_draw, "POST_PIXEL")

@@ -13,13 +13,13 @@ from gpu_extras.batch import batch_for_shader
 from ..branch import branches
 from ..plan import energy_field
 from . import frame_colours, scene
-from .view_borders import covered_width
+from .graph import strip
+from .view_borders import covered_width, write
 
 _MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
 _BETWEEN, _LINE_LETTERS = 20, 20
 _KEY_LINE, _KEY_SIZE = 18, 10
 _GAP = 60  # above the lower edge: Blender's text there stays readable
-_handle: list = []
 
 
 def shown_scales(surface: bpy.types.Object) -> list[dict]:
@@ -53,13 +53,9 @@ def _scale_at_rest(surface: bpy.types.Object) -> dict | None:
 def bar(stops: list[list[float]], x: float, y: float, width: float, height: float,
         ) -> tuple[list, list, list]:
     """Return corners, their colours and triangles of a bar of rows ``[position, r, g, b]``."""
-    places, colours, triangles = [], [], []
-    for position, *colour in stops:
-        places += [(x, y + position * height), (x + width, y + position * height)]
-        colours += [(*display(np.array(colour)), 1.0)] * 2
-    for k in range(0, len(places) - 2, 2):
-        triangles += [(k, k + 1, k + 2), (k + 1, k + 3, k + 2)]
-    return places, colours, triangles
+    places, triangles = strip([[y + stop[0] * height, x, x + width] for stop in stops])
+    colours = [(*display(np.array(stop[1:])), 1.0) for stop in stops for _ in range(2)]
+    return [place[::-1] for place in places], colours, triangles
 
 
 def display(linear: np.ndarray) -> np.ndarray:
@@ -103,33 +99,15 @@ def _draw_key(kind: str, x: float, y: float, size: float) -> None:
     batch_for_shader(shader, "TRIS", {"pos": [(x, y), (x + side, y), (x + side, y + side),
                                               (x, y + side)]},
                      indices=[(0, 1, 2), (0, 2, 3)]).draw(shader)
-    _in_white(size)
-    blf.position(0, x + side + 6 * size, y, 0)
-    blf.draw(0, scene.NAMES[kind])
-    blf.disable(0, blf.SHADOW)
-
-
-def _in_white(size: float) -> None:
-    """Set the font so that it is legible before any background."""
-    blf.size(0, _TEXT * size)
-    blf.color(0, 1.0, 1.0, 1.0, 1.0)
-    blf.enable(0, blf.SHADOW)
-    blf.shadow(0, 5, 0.0, 0.0, 0.0, 0.9)
+    write([scene.NAMES[kind]], x + side + 6 * size, y, _TEXT * size, 0.0)
 
 
 def _write(scale: dict, x: float, y: float, size: float) -> float:
     """Write title and values of a scale; returns its width [pixels]."""
-    _in_white(size)
-    ticks = scale["ticks"]
-    for number, tick in enumerate(ticks):
-        share = number / max(len(ticks) - 1, 1)
-        blf.position(0, x + (_WIDTH + 6) * size, y + (share * _HEIGHT - 4) * size, 0)
-        blf.draw(0, str(tick))
-    lines = _title_lines(scale)
-    for number, line in enumerate(reversed(lines)):
-        blf.position(0, x, y + (_HEIGHT + 10 + 16 * number) * size, 0)
-        blf.draw(0, line)
-    blf.disable(0, blf.SHADOW)
+    ticks, lines = scale["ticks"], _title_lines(scale)
+    write(map(str, ticks), x + (_WIDTH + 6) * size, y - 4 * size, _TEXT * size,
+          _HEIGHT * size / max(len(ticks) - 1, 1))
+    write(reversed(lines), x, y + (_HEIGHT + 10) * size, _TEXT * size, 16 * size)
     return max(blf.dimensions(0, line)[0] for line in lines)
 
 
@@ -137,11 +115,4 @@ def _title_lines(scale: dict) -> list[str]:
     return textwrap.wrap(scale["title"] + (", log scale" if scale["log"] else ""), _LINE_LETTERS)
 
 
-def register() -> None:
-    if not bpy.app.background:
-        _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
-
-
-def unregister() -> None:
-    while _handle:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
+DRAWN = (_draw, "POST_PIXEL")

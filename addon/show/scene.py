@@ -27,7 +27,7 @@ from ..branch.branches import (
     token_of,
 )
 from ..branch.parts import ShownBranch
-from ..bridge import animation, colour_nodes, curves, materials, meshes, skeletons
+from ..bridge import animation, curves, materials, meshes, node_groups, skeletons
 from ..plan import energy_field, goal_ball
 from ..skeleton.skeleton_edits import Skeleton
 from . import annotations, frame_colours
@@ -211,10 +211,12 @@ def _put_surface(shown: ShownBranch, data: SceneData) -> bool:
     name = data.info["name"]
     mesh = meshes.new_mesh(name, data.arrays["vertices"], data.arrays["faces"])
     for key, scale in data.info["scalars"].items():
-        colour_nodes.colour_group(scale["colours"], scale["stops"])
-        meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
-        meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])
+        node_groups.colour_group(scale["colours"], scale["stops"])
+        meshes.set_values(mesh, key, data.arrays[f"scalar:{key}"])
+        meshes.set_values(mesh, f"{key}_color", data.arrays[f"color:{key}"], "FLOAT_COLOR")
     meshes.set_one_color(mesh, materials.WOOD_COLOUR, f"{materials.WOOD}_color")
+    meshes.set_values(mesh, node_groups.REST, data.arrays["vertices"], "FLOAT_VECTOR")
+    node_groups.add_styles()
     surface, is_new = shown.put("surface", name, mesh)
     shown.surface = surface
     # Not the folder: it may move, and the file with it.
@@ -288,9 +290,9 @@ def _add_skeleton(shown: ShownBranch, data: SceneData) -> None:
             not skeletons.is_of(before.data, skeleton) and skeletons.is_edited(before)):
         shown.notes.append("The skeleton was made again. Edits that were not applied are lost")
     mesh = skeletons.new_skeleton("Skeleton", skeleton, data.arrays["skeleton_flags"])
-    meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
+    meshes.set_values(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
     if "skeleton_probability" in data.arrays:
-        meshes.set_scalars(mesh, "probability", data.arrays["skeleton_probability"])
+        meshes.set_values(mesh, "probability", data.arrays["skeleton_probability"])
     thing, is_new = shown.put("skeleton", "Skeleton", mesh)
     if is_new:
         thing.hide_viewport = thing.hide_render = thing.show_in_front = True

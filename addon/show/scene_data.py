@@ -18,27 +18,21 @@ FORMAT = 2
 _LARGEST_BYTES = 4 << 30
 _MOST_ARRAYS = 500
 
-# Dimensions by letter: v vertices, f faces, c points of the cloud, n skeleton nodes, k control
-# points, t targets, s frames, o observations, m observed points, g gripper poses, w points to be
-# seen, p points of a path (each path has its own), q nodes of a search tree, u vertices and x faces
-# of rods (likewise), y colours of a palette, l positions along an arm, h, j, z points along the
-# edges of a grid. i: integers, b: booleans, r: real numbers.
+# Of the arrays that are drawn. Dimensions by letter: v vertices, f faces, n skeleton nodes, k
+# control points, t targets, s frames, m observed points, w points to be seen, p points of a path
+# (each has its own), q nodes of a search tree, u vertices and x faces of rods (likewise), y colours
+# of a palette, l positions along an arm, h, j, z points along the edges of a grid. i: integers,
+# b: booleans, r: real numbers.
 _SHAPES = {
     "vertices": "v3 r", "faces": "f3 i", "scalar": "v r", "color": "v4 r", "frame_scalar": "sv r",
     "frame_level": "sv i", "palette": "y4 r",
-    "frame_times": "s r", "frame_energy": "s r", "frame_kinetic_energy": "s r",
-    "frame_min_det_f": "s r", "frame_strain": "s r", "frame_bounds": "23 r",
-    "cloud": "c3 r", "cloud_color": "c4 r",
+    "frame_times": "s r", "frame_energy": "s r",
     "skeleton": "n3 r", "skeleton_parent": "n i", "skeleton_radius": "n r",
-    "skeleton_radius_sigma": "n r", "skeleton_probability": "n r",
-    "skeleton_order": "n i", "skeleton_flags": "n i",
+    "skeleton_radius_sigma": "n r", "skeleton_probability": "n r", "skeleton_flags": "n i",
     "control_points": "k3 r", "control_points_radius": "k r", "control_points_motion": "sk3 r",
     "grasp": "13 r", "grasp_radius": "1 r", "grasp_motion": "s3 r",
     "targets": "t3 r", "targets_radius": "t r", "targets_motion": "st3 r",
-    "path": "p3 r", "path_pose": "p6 r", "path_energy": "p r", "path_force": "p r",
-    "path_strain": "p r", "path_color": "p4 r", "tree": "q3 r", "tree_parent": "q i",
-    "observation": "om3 r", "observation_visible": "om b", "observation_times": "o r",
-    "observation_grasp": "g3 r", "observation_grasp_times": "g r",
+    "path": "p3 r", "tree": "q3 r", "tree_parent": "q i",
     "observation_motion": "sm3 r", "observation_seen": "sm b",
     "rods": "u3 r", "rod_faces": "x3 i", "rod_color": "u4 r",
     "energy_grid": "hjz r", "energy_grid_color": "hjz4 r",

@@ -21,10 +21,9 @@ PAPER = (0.779, 0.8075, 0.836)
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendered picture: width [pixels], most samples per pixel, room for a legend."""
+    """A rendered picture: width [pixels], room for a legend."""
 
     width: int = 1120
-    samples: int = 32
     legend_share: float = LEGEND_SHARE
     """Fraction of the width that is kept free on the left, for a legend; 0 without one."""
 
@@ -56,7 +55,7 @@ def _set_rendering(scene: bpy.types.Scene, picture: Picture) -> None:
     cycles.device = "CPU"
     cycles.use_denoising = compat.can_denoise()
     # Without a denoiser, use more samples instead.
-    cycles.samples = picture.samples if compat.can_denoise() else 4 * picture.samples
+    cycles.samples = 32 if compat.can_denoise() else 128
     # Most of the picture is plain background: it needs few samples, and a tenth of the time.
     cycles.use_adaptive_sampling = True
     if hasattr(cycles, "denoising_quality"):

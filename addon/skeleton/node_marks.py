@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import bpy
 import gpu
 import numpy as np
-from bpy.app.handlers import persistent
 from gpu_extras.batch import batch_for_shader
 
 from .. import compat
@@ -36,7 +35,6 @@ class Marks:
 
 
 _kept: dict[tuple[str, str], Marks] = {}
-_handle: list = []
 
 
 def marks_in_sight(thing: bpy.types.Object) -> Marks:
@@ -102,7 +100,6 @@ def _draw_batch(batches: dict, name: str, kind: str, points: np.ndarray, color) 
     batches[name].draw(shader)
 
 
-@persistent
 def _changed(_scene, depsgraph=None) -> None:
     """Check the nodes again only if a mesh or an object has changed."""
     if depsgraph is None or depsgraph.id_type_updated("MESH") or (
@@ -110,25 +107,11 @@ def _changed(_scene, depsgraph=None) -> None:
         _kept.clear()
 
 
-@persistent
 def _renewed(*_) -> None:
     _kept.clear()
 
 
-def register() -> None:
-    bpy.app.handlers.depsgraph_update_post.append(_changed)
-    for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post,
-                     bpy.app.handlers.load_post):
-        handlers.append(_renewed)
-    if not bpy.app.background:
-        _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW"))
-
-
-def unregister() -> None:
-    while _handle:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
-    for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post,
-                     bpy.app.handlers.load_post):
-        handlers.remove(_renewed)
-    bpy.app.handlers.depsgraph_update_post.remove(_changed)
-    _kept.clear()
+DRAWN = (_draw, "POST_VIEW")
+HANDLERS = (("depsgraph_update_post", _changed), ("undo_post", _renewed), ("redo_post", _renewed),
+            ("load_post", _renewed))
+unregister = _kept.clear

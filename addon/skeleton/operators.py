@@ -17,7 +17,7 @@ from ..bridge import skeletons
 from ..jobs.worker_operator import WorkerOperator
 from .skeleton_edits import Mark, SkeletonEditError, edits_of
 
-_ACTIONS = (
+ACTIONS = (
     ("DELETE", "Delete Branch", "Delete the selected nodes and everything that they carry"),
     ("BRIDGE", "Bridge", "Attach the whole branch of the first node to the node selected last"),
     ("MERGE", "Merge", "Merge the branch, up to the first node, with the branch of the node "
@@ -61,7 +61,7 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
     bl_label = "Edit Node"
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
-    action: bpy.props.EnumProperty(name="What", items=_ACTIONS)
+    action: bpy.props.EnumProperty(name="What", items=ACTIONS)
     radius: bpy.props.FloatProperty(
         name="Radius [m]", default=0.005, min=1e-5, soft_max=0.5, precision=5,
         description="Radius of the selected nodes")
@@ -74,7 +74,7 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context, properties):
-        return next(told for name, _, told in _ACTIONS if name == properties.action)
+        return next(told for name, _, told in ACTIONS if name == properties.action)
 
     def invoke(self, context, event):
         thing = branches.find_skeleton(context.scene)

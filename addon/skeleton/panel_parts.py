@@ -9,10 +9,9 @@ import bpy
 from ..branch import branch_folder, branches
 from ..panels.lines import draw_text
 from . import node_marks as overlay
+from .operators import ACTIONS
 
 _BUTTONS = (("DELETE", "CONFIRM"), ("BRIDGE", "MERGE"), ("SPLIT", "ROOT"), ("RADIUS", "NONE"))
-_LABELS = {"DELETE": "Delete Branch", "CONFIRM": "Confirm", "BRIDGE": "Bridge", "MERGE": "Merge",
-           "SPLIT": "Split", "ROOT": "Set Root", "RADIUS": "Set Radius", "NONE": "Unmark"}
 _DIFFERENCES = {"delete": ("branch less", "branches less"), "add": ("twig more", "twigs more"),
                 "split": ("attached elsewhere",) * 2, "root": ("root elsewhere",) * 2}
 
@@ -32,10 +31,11 @@ def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     else:
         draw_text(body, context, "Move: G. To bridge, merge or split, select the branch, then "
                   "with Shift the node to attach to", "INFO")
+        titles = {name: title for name, title, _ in ACTIONS}
         for pair in _BUTTONS:
             row = body.row(align=True)
             for action in pair:
-                row.operator("limber.edit_node", text=_LABELS[action]).action = action
+                row.operator("limber.edit_node", text=titles[action]).action = action
     column = body.column(align=True)
     for words in overlay.WORDS.values():
         draw_text(column, context, words, "DOT")

@@ -30,6 +30,11 @@ PATH_COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energ
                 "strain")
 
 
+def part(name: str):
+    """Return a module of the add-on."""
+    return importlib.import_module(f"limber_addon.{name}")
+
+
 @dataclass(frozen=True)
 class BeamBranch:
     """A branch folder of a beam that bends by a formula: every frame is known."""
@@ -70,7 +75,7 @@ def make_beam_branch(folder: Path, frame_count: int = 6, *, plan: bool = True) -
         stage.result["length_m"] = 0.6
     if plan:
         with branch.stage("plan:to-goal", reads=["mesh.vtu"]) as stage:
-            _write_plan(stage, path)
+            write_plan(stage, path)
             _write_pc2(stage.path("frames/to-goal.pc2"), frames)
             stage.path("frames/to-goal.json").write_text(json.dumps(
                 {"frame_count": frame_count, "energies_j": list(0.01 * amounts)}))
@@ -80,7 +85,7 @@ def make_beam_branch(folder: Path, frame_count: int = 6, *, plan: bool = True) -
     return BeamBranch(folder, mesh, surface, frames, path)
 
 
-def _write_plan(stage, path: np.ndarray) -> None:
+def write_plan(stage, path: np.ndarray) -> None:
     for name, points in (("to-goal", path), ("to-goal-baseline", path + [[0.0, 0.01, 0.0]])):
         with open(stage.path(f"plans/{name}.csv"), "w", newline="") as stream:
             writer = csv.writer(stream)
@@ -166,19 +171,19 @@ def whole_texts(registered, monkeypatch):
 
     Every module is loaded before: one that took the replaced function would keep it.
     """
-    lines = importlib.import_module("limber_addon.panels.lines")
+    lines = part("panels.lines")
     monkeypatch.setattr(lines, "wrapped", lambda text, _space: (text,) if text else ())
 
 
-class _Ended:
-    """A process that has ended, as a job sees one."""
+class Ended:
+    """A worker's process that has ended, as a job sees one, and what it said."""
 
-    def __init__(self, code: int):
-        self.returncode = code
-        self.stdin = io.StringIO()
+    def __init__(self, code: int = 0, *told: dict | str):
+        self.poll, self.stdin = lambda: code, io.StringIO()
+        self._told = list(told or [{"status": "done", "seconds": 0.0}])
 
-    def poll(self) -> int:
-        return self.returncode
+    def told(self) -> list[dict | str]:
+        return [self._told.pop(0) for _ in list(self._told)]
 
 
 @pytest.fixture()
@@ -188,19 +193,18 @@ def worker_here(registered, monkeypatch):
     For tests of what is asked of the worker and what is done with its answer. Those of operators
     and jobs start it as the process that it is.
     """
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     launch = jobs.Job.launch
 
     def launch_here(job) -> None:
         if job.command[1:3] != ["-m", "limber"]:
             return launch(job)
-        said, log = io.StringIO(), io.StringIO()
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(log):
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             code = call(job.command[3:])
-        for name, stream in (("out", said), ("err", log)):
-            for line in stream.getvalue().splitlines():
-                job._lines.put((name, line))
-        job._process, job._readers = _Ended(code), []
+        object_in = part("jobs.worker_process")._object_in
+        job._process = Ended(code, *(object_in(line) or line
+                                     for line in said.getvalue().splitlines()))
         job.state = jobs.JobState.RUNNING
         return None
     monkeypatch.setattr(jobs.Job, "launch", launch_here)

@@ -1,7 +1,6 @@
 """A worker that is killed, hangs, prints rubbish, is of another version or is missing: each is said
 in words, and the next one works."""
 
-import importlib
 import json
 import os
 import sys
@@ -10,13 +9,9 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from tests.addon.conftest import part
 
 from limber.store import Branch
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
-
 
 GOOD = "print(json.dumps({'status': 'done', 'seconds': 0.1}))"
 BAD = {
@@ -117,7 +112,7 @@ def test_panels_look_for_the_worker_now_and_then(bpy, registered, monkeypatch):
     assert len(looked) == 1
 
 
-def test_a_running_job_redraws_the_sidebar_alone(bpy, registered):
+def test_a_running_job_redraws_the_sidebar_alone(bpy, registered, monkeypatch):
     """Not the view beside it, which may show a million points."""
     drawn = []
 
@@ -126,8 +121,11 @@ def test_a_running_job_redraws_the_sidebar_alone(bpy, registered):
     area = SimpleNamespace(type="VIEW_3D", regions=[region("WINDOW"), region("UI")],
                            tag_redraw=lambda: drawn.append("all of it"))
     window = SimpleNamespace(screen=SimpleNamespace(areas=[area]))
-    part("jobs.worker_operator").redraw_sidebars(
-        SimpleNamespace(window_manager=SimpleNamespace(windows=[window])))
+    operator = part("jobs.worker_operator")
+    with monkeypatch.context() as patched:
+        patched.setattr(operator, "bpy", SimpleNamespace(context=SimpleNamespace(
+            window_manager=SimpleNamespace(windows=[window]))))
+        operator.redraw_sidebars()
     assert drawn == ["UI"]
 
 

@@ -1,19 +1,19 @@
 """Arrays go to Blender's data and come back the same; wrong ones are refused."""
 
-import importlib
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 
 @pytest.fixture()
 def meshes(addon):
-    return importlib.import_module("limber_addon.bridge.meshes")
+    return part("bridge.meshes")
 
 
 @pytest.fixture()
 def animation(addon):
-    return importlib.import_module("limber_addon.bridge.animation")
+    return part("bridge.animation")
 
 
 def _random_mesh(meshes, seed=3, count=50):
@@ -38,11 +38,11 @@ def test_attribute_round_trip(meshes):
     _, _, mesh = _random_mesh(meshes)
     young = np.geomspace(1e6, 1e9, 50)
     for values in (young, young[::-1]):
-        meshes.set_scalars(mesh, "young", values)
-        np.testing.assert_allclose(meshes.scalars(mesh, "young"), values, rtol=1e-6)
+        meshes.set_values(mesh, "young", values)
+        np.testing.assert_allclose(meshes.values_of(mesh, "young"), values, rtol=1e-6)
     assert mesh.attributes["young"].data_type == "FLOAT"
     colours = np.random.default_rng(1).random((50, 4))
-    meshes.set_colors(mesh, "young_color", colours)
+    meshes.set_values(mesh, "young_color", colours, "FLOAT_COLOR")
     found = np.empty(200, np.float32)
     mesh.color_attributes.active_color.data.foreach_get("color", found)
     np.testing.assert_allclose(found.reshape(-1, 4), colours, atol=1e-6)
@@ -73,17 +73,17 @@ def test_wrong_attributes_are_refused(meshes):
     """An attribute of another length or with NaN raises."""
     _, _, mesh = _random_mesh(meshes)
     with pytest.raises(ValueError, match="49 values for 50"):
-        meshes.set_scalars(mesh, "young", np.ones(49))
+        meshes.set_values(mesh, "young", np.ones(49))
     with pytest.raises(ValueError, match="not finite"):
-        meshes.set_scalars(mesh, "young", np.full(50, np.nan))
+        meshes.set_values(mesh, "young", np.full(50, np.nan))
     with pytest.raises(ValueError):
         meshes.set_positions(mesh, np.zeros((49, 3)))
 
 
 def test_a_tube_lies_about_its_points(addon):
     """Every vertex at the radius of a straight path; one that is not finite is refused."""
-    curves = importlib.import_module("limber_addon.bridge.curves")
-    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    curves = part("bridge.curves")
+    meshes = part("bridge.meshes")
     points = np.column_stack([np.zeros(9), np.zeros(9), np.linspace(0, 1, 9)])
     tube = meshes.positions(curves.new_tube("path", points, 0.01))
     np.testing.assert_allclose(np.linalg.norm(tube[:, :2], axis=1), 0.01, rtol=1e-4)
@@ -114,7 +114,7 @@ def test_damaged_caches_are_refused(animation, meshes, beam, bpy, tmp_path):
 
 def test_log_colours_in_the_material(addon):
     """The material maps the attribute's logarithm over its range."""
-    materials = importlib.import_module("limber_addon.bridge.materials")
+    materials = part("bridge.materials")
     stops = [[0.0, 0, 0, 0], [0.5, 0.2, 0.3, 0.4], [1.0, 1, 1, 1]]
     material = materials.scalar_material("E", "young", low=1e6, high=1e9, log=True, stops=stops)
     nodes = {node.type: node for node in material.node_tree.nodes}

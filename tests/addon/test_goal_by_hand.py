@@ -1,22 +1,16 @@
 """The goal's ball in the view and the goal of the plan are one; a plan samples what it lacks."""
 
-import importlib
-import io
 import json
 import math
 import shutil
 
 import numpy as np
 import pytest
-from tests.addon.conftest import ROOT
+from tests.addon.conftest import ROOT, Ended, part
 
 from limber.planning.field.energy_field import EnergyField
 
 pytestmark = pytest.mark.usefixtures("worker_here")
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
 
 
 @pytest.fixture()
@@ -126,10 +120,7 @@ def test_a_plan_samples_the_energy_that_it_lacks(bpy, registered, bare_beam, mon
             content["stages"]["energy"] = {"settings": {}, "reads": {}, "result": {},
                                            "finished": "2030-01-01"}
             path.write_text(json.dumps(content))
-        if not code[-1]:
-            job._lines.put(("out", json.dumps({"status": "done", "seconds": 0.0})))
-        job._process, job._readers = type("Ended", (), {
-            "stdin": io.StringIO(), "poll": lambda self: code[-1]})(), []
+        job._process = Ended(code[-1], *([""] * bool(code[-1])))
         job.state = jobs.JobState.RUNNING
         return None
     monkeypatch.setattr(jobs.Job, "launch", launch_here)
@@ -211,9 +202,9 @@ def test_the_slice_shows_the_energy_field(bpy, registered, tmp_path):
     points = meshes.positions(thing.data).astype(float)
     colours = part("plan.energy_field").colours_at(thing, points)
     assert len(points) > 100 and (colours[:, 3] > 0.99).mean() > 0.99
-    np.testing.assert_allclose(meshes.scalars(thing.data, "energy_j"), field.energy(points),
+    np.testing.assert_allclose(meshes.values_of(thing.data, "energy_j"), field.energy(points),
                                rtol=2e-2, atol=1e-5)
-    np.testing.assert_allclose(colours, meshes.colors(thing.data, "color"), atol=0.02)
+    np.testing.assert_allclose(colours, meshes.values_of(thing.data, "color"), atol=0.02)
     aside = points + [0.0, 0.0, 0.5]
     assert (part("plan.energy_field").colours_at(thing, aside)[:, 3] == 0).all()
     place = Vector(field.rest) + Vector((2.0, 0.0, 0.0))

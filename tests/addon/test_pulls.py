@@ -2,23 +2,19 @@
 distance."""
 
 import csv
-import importlib
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 from limber.results.scene.animation import scene_data
 from limber.store import Branch
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 SEEN = np.array([[0.0, 0, 0.5], [0.1, 0, 0.5], [0.2, 0, 0.5]])
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
 
 
 @pytest.fixture()
@@ -104,7 +100,7 @@ def test_force_and_distance_follow_too(bpy, opened):
     greatest = []
     for frame in (1, 61):
         scene.frame_set(frame)
-        greatest.append(part("bridge.meshes").scalars(opened.data, "now").max())
+        greatest.append(part("bridge.meshes").values_of(opened.data, "now").max())
     # Measured 0.2 m to the side; the beam's formula has 0.25 m there.
     assert greatest[0] < 1e-6 and greatest[1] == pytest.approx(0.05, rel=0.05)
 

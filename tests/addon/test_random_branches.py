@@ -3,8 +3,6 @@
 ``LIMBER_RANDOM_OPERATORS=500`` tries as many, with the seed ``LIMBER_RANDOM_SEED``.
 """
 
-import importlib
-import io
 import json
 import os
 import random
@@ -12,13 +10,10 @@ import shutil
 from pathlib import Path
 
 import pytest
+from tests.addon.conftest import Ended, part
 
 COUNT = int(os.environ.get("LIMBER_RANDOM_OPERATORS", "40"))
 WRITTEN = "written-by-the-test.json"
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
 
 
 class Run:
@@ -147,7 +142,7 @@ def three(bpy, registered, tmp_path, bare_beam, monkeypatch):
 def quick_worker(worker_here, monkeypatch):
     """``target`` and ``plan`` write their name into the folder that they are given, ``energy``
     writes nothing; all else is the real worker."""
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     launch = jobs.Job.launch
 
     def launch_here(job):
@@ -160,9 +155,7 @@ def quick_worker(worker_here, monkeypatch):
         path = Path(folder) / WRITTEN
         written = json.loads(path.read_text()) if path.is_file() else []
         path.write_text(json.dumps([*written, *names]))
-        job._lines.put(("out", json.dumps({"status": "done", "seconds": 0.0})))
-        job._process, job._readers = type("Ended", (), {
-            "stdin": io.StringIO(), "poll": lambda self: 0})(), []
+        job._process = Ended()
         job.state = jobs.JobState.RUNNING
         return None
     monkeypatch.setattr(jobs.Job, "launch", launch_here)

@@ -1,11 +1,11 @@
 """The process of the worker on Windows, as far as another system can tell: jobs, no console."""
 
 import ctypes
-import importlib
 import io
 import subprocess
 
 import pytest
+from tests.addon.conftest import part
 
 
 class Kernel:
@@ -26,7 +26,7 @@ class Kernel:
 
 @pytest.fixture()
 def process(addon):
-    return importlib.import_module("limber_addon.jobs.worker_process")
+    return part("jobs.worker_process")
 
 
 def test_the_job_object_ends_with_blender(process):
@@ -54,7 +54,8 @@ def test_windows_gets_no_console_and_the_whole_tree_ends(process, monkeypatch, j
     monkeypatch.setattr(process, "_kernel", lambda: kernel)
     monkeypatch.setattr(process, "_job_object", lambda _kernel, _handle: job)
     monkeypatch.setattr(subprocess.Popen, "__init__",
-                        lambda self, command, **rest: started.update(rest))
+                        lambda self, command, **rest: (started.update(rest), vars(self).update(
+                            stdout=io.StringIO(), stderr=io.StringIO())))
     monkeypatch.setattr(subprocess.Popen, "__del__", lambda self: None)
     monkeypatch.setattr(subprocess.Popen, "kill", lambda self: killed.append("worker"))
     monkeypatch.setattr(process.WorkerProcess, "_handle", 5, raising=False)

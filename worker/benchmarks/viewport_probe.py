@@ -78,11 +78,11 @@ def frame_write(count: int, repeats: int) -> None:
 def import_points(path: Path) -> None:
     """A scan as a user's import has it: read by a thread, then shown at once."""
     longest, started = 0.0, time.perf_counter()
-    reading, last = part("scan.scans").Reading(path), started
-    while not reading.is_done:
+    reading, last = part("scan.scans").reading(path), started
+    while not reading.done():
         time.sleep(0.005)
         longest, last = max(longest, time.perf_counter() - last), time.perf_counter()
-    scan = reading.scan()
+    scan = reading.result()
     mesh = part("bridge.meshes").new_mesh("cloud", scan.points)
     cloud = part("branch.branches").add_object(bpy.context.scene.collection, "cloud", mesh)
     bpy.context.view_layer.update()
