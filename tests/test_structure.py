@@ -1,7 +1,12 @@
 """Rules of the layout: the core never imports bpy, the add-on holds no mathematics."""
 
 import ast
+import doctest
 import functools
+import importlib
+import re
+import subprocess
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,8 +103,6 @@ def test_benches_need_no_tests():
 
 def test_top_level_is_as_designed():
     """Only the designed folders and the files that tools expect stand at the top."""
-    import subprocess
-
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True,
                              check=True).stdout.splitlines()
     top = {name.split("/")[0] for name in tracked}
@@ -112,9 +115,6 @@ def test_top_level_is_as_designed():
 
 def test_nothing_names_an_index_or_this_machine():
     """No tracked file names a package index's host or a path of the machine it was made on."""
-    import re
-    import subprocess
-
     pattern = re.compile(rb"pypi\.org|pythonhosted|deb\.debian\.org|--index-url|--extra-index")
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True,
                              check=True).stdout.splitlines()
@@ -125,10 +125,6 @@ def test_nothing_names_an_index_or_this_machine():
 
 def test_no_text_advises_the_stranger_of_our_name():
     """The package index's `limber` is another program: ours is `limber-branch`."""
-    import re
-    import subprocess
-    import tomllib
-
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["name"] == DISTRIBUTION
     # `pip install 'limber[report]'`, `pip install -U limber`, limber[report], limber==0.1.
@@ -187,9 +183,6 @@ def test_only_stages_open_branch_folders():
                                      "planning", "core.json_values"])
 def test_public_names_are_there(package):
     """All that a package exports loads, and the example in its docstring runs."""
-    import doctest
-    import importlib
-
     module = importlib.import_module(f"limber.{package}")
     for name in getattr(module, "__all__", ()):
         assert getattr(module, name).__doc__, name
@@ -201,9 +194,6 @@ def test_public_names_are_there(package):
 @pytest.mark.slow
 def test_dependencies_are_imported():
     """Every dependency in pyproject.toml is imported by the core or called by it by name."""
-    import re
-    import tomllib
-
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     imported = set().union(*imported_modules(CORE).values())
     modules = {"pillow": "PIL", "ur-rtde": "rtde_control"}

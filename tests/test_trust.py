@@ -7,12 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest
 from limber.core.settings import checked_settings
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.recordings.image_folders import copy_rgbd
+from limber.recordings.settings import ImportSpec
 from limber.results.scene.animation import scene_data
+from limber.stages.moduli.predict import Predict
 from limber.store import Branch
+from limber.store.loading import load_mesh, load_point_masses
 
 EXAMPLE = Path(__file__).parents[1] / "blend_files" / "bending_branch"
 
@@ -69,8 +76,6 @@ def test_files_of_noise(damaged, name):
     (["poisson"], 3), (["groups", 0], 99), (["causes"], [1])])
 def test_an_estimate_that_does_not_fit_itself(damaged, path, value):
     """`limber predict` and the report refuse it, and say where."""
-    from limber.stages.moduli.predict import Predict
-
     branch = damaged("estimate.json", _changed("estimate.json", *path, value=value))
     with pytest.raises(InputError, match=r"estimate\.json"):
         Predict(branch_folder=branch.folder, weight=1.0).run()
@@ -81,17 +86,12 @@ def test_an_estimate_that_does_not_fit_itself(damaged, path, value):
     [{"mass_kg": 1, "attached_m": [0, 0, None]}], [{"mass_kg": 1, "attached_m": [0, 0]}]])
 def test_point_masses(damaged, content):
     """No negative mass, no place without three numbers."""
-    from limber.store.loading import load_point_masses
-
     with pytest.raises(InputError, match=r"point_masses\.json"):
         load_point_masses(damaged("point_masses.json", json.dumps(content).encode()))
 
 
 def test_a_mesh_whose_data_are_no_numbers(damaged):
     """A modulus of NaN, and a tetrahedron of a node that is not there."""
-    from limber.geometry.tets.tet_mesh import TetMesh
-    from limber.store.loading import load_mesh
-
     mesh = TetMesh.read(EXAMPLE / "mesh.vtu")
     for wrong in (mesh.with_data(cell_data={"young": np.full(mesh.tet_count, np.nan)}),
                   TetMesh(mesh.nodes, mesh.tets + mesh.node_count - 5)):
@@ -116,8 +116,6 @@ def test_an_alignment_that_is_no_turn(damaged):
     ("camera_at", (np.nan, 0.0, 1.0)), ("young", np.inf)])
 def test_options_are_finite_and_directions_have_a_length(name, value):
     """`--up 0 0 0`, `--camera-at nan` and their like are refused by name."""
-    from limber.geometry.settings import ReconstructSettings
-
     with pytest.raises(InputError, match=f"--{name.replace('_', '-')}"):
         checked_settings(ReconstructSettings, {name: value})
 
@@ -153,11 +151,6 @@ def test_moduli_and_densities_are_those_of_matter(model, values, told):
 
 def test_lists_of_a_recording_stay_in_its_folder(tmp_path):
     """A depth list that names a file elsewhere is refused; so are turns of length 0."""
-    from PIL import Image
-
-    from limber.recordings.image_folders import copy_rgbd
-    from limber.recordings.settings import ImportSpec
-
     (tmp_path / "in" / "depth").mkdir(parents=True)
     for name in ("in/depth/1.png", "in/depth/2.png", "secret.png"):
         Image.fromarray(np.full((4, 6), 700, np.uint16)).save(tmp_path / name)

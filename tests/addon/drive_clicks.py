@@ -6,16 +6,15 @@ import sys
 from pathlib import Path
 
 import bpy
-from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
 import mouse
-from driving import KEY, drive, picture, processor_seconds, seen, started, view, waited
+from driving import drive, part, picture, processor_seconds, seen, started, view, waited
 
 
 def is_open():
     return "bending_branch" in bpy.data.objects and waited(1.0) and (
-        not sys.modules[f"{KEY}.jobs.jobs"].is_running())
+        not part("jobs.jobs").is_running())
 
 
 def places():
@@ -27,27 +26,22 @@ def places():
 
 def is_held():
     """The session answers, and its first frame is drawn: then the branch can be pressed."""
-    sessions = sys.modules[f"{KEY}.bend.session"]._open
+    sessions = part("bend.session")._open
     if not (sessions and sessions[0].hello):
         return False
     mouse.at["before"] = places()
     return waited(0.5)
 
 
-def point_at_branch():
-    """At a vertex in sight, two thirds up."""
+def front_place():
+    """A vertex in sight, two thirds up."""
     thing = bpy.data.objects["bending_branch"]
-    _, area, region = view()
     low, high = (pick(vertex.co.z for vertex in thing.data.vertices) for pick in (min, max))
-    origin = area.spaces.active.region_3d.view_matrix.inverted().translation
+    origin = view()[1].spaces.active.region_3d.view_matrix.inverted().translation
     front = [vertex for vertex in thing.data.vertices
              if abs(vertex.co.z - low - 0.66 * (high - low)) < 0.05 * (high - low)]
     nearest = min(front, key=lambda vertex: (vertex.co - origin).length)
-    place = view3d_utils.location_3d_to_region_2d(
-        region, area.spaces.active.region_3d, thing.matrix_world @ nearest.co)
-    mouse.at.update(x=region.x + place.x, y=region.y + place.y)
-    mouse.event("MOUSEMOVE")
-    return True
+    return thing.matrix_world @ nearest.co
 
 
 def drag():
@@ -56,7 +50,7 @@ def drag():
     seen["clicks_to_bent"] = seen["clicks"]
     seen["bent_m"] = max(abs(a - b) for a, b in zip(places(), mouse.at["before"], strict=True))
     if seen["bent_m"] > 0.0 and "answer_s" not in seen:
-        seen["answer_s"] = processor_seconds(sys.modules[f"{KEY}.bend.session"]._open[0].pid)
+        seen["answer_s"] = processor_seconds(part("bend.session")._open[0].pid)
     return seen["bent_m"] > 0.01
 
 
@@ -71,17 +65,12 @@ def leave():
 
 
 def goal():
-    branch = bpy.data.collections["bending_branch"]
-    return sys.modules[f"{KEY}.plan.goal_ball"].of(branch)
+    return part("plan.goal_ball").of(bpy.data.collections["bending_branch"])
 
 
-def point_at_goal():
-    _, area, region = view()
-    place = view3d_utils.location_3d_to_region_2d(
-        region, area.spaces.active.region_3d, goal().matrix_world.translation)
-    mouse.at.update(x=region.x + place.x, y=region.y + place.y, goal=goal().location.copy())
-    mouse.event("MOUSEMOVE")
-    return waited(0.3)
+def goal_place():
+    mouse.at["goal"] = goal().location.copy()
+    return goal().matrix_world.translation
 
 
 def drag_goal():
@@ -101,7 +90,7 @@ def is_goal_planned():
 drive([mouse.open_sidebar, mouse.is_sidebar_open, mouse.point_at_tab, mouse.click, mouse.is_ours,
        picture("tab"),
        mouse.find("open_example"), mouse.click, is_open, picture("example"),
-       mouse.find("grab"), mouse.click, is_held, point_at_branch, mouse.press, drag,
+       mouse.find("grab"), mouse.click, is_held, mouse.point_at(front_place), mouse.press, drag,
        picture("bent"), mouse.let_go, leave,
-       point_at_goal, mouse.press, drag_goal, picture("goal"), mouse.let_go, is_goal_planned],
-      longest=120)
+       mouse.point_at(goal_place), mouse.press, drag_goal, picture("goal"), mouse.let_go,
+       is_goal_planned], longest=120)

@@ -10,7 +10,7 @@ import bpy
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, start, view
+from driving import FOLDER, drive, is_tab_open, part, picture, seen, start, undo, view
 
 
 def begin():
@@ -22,7 +22,7 @@ def begin():
 def shown(name):
     """Return the step that waits for an object."""
     def step():
-        return name in bpy.data.objects and not sys.modules[f"{KEY}.jobs.jobs"].is_running()
+        return name in bpy.data.objects and not part("jobs.jobs").is_running()
     step.__name__ = f"{name} shown"
     return step
 
@@ -48,12 +48,6 @@ def look(name):
         return True
     step.__name__ = f"look at {name}"
     return step
-
-
-def undo():
-    with override():
-        bpy.ops.ed.undo()
-    return True
 
 
 def is_undone():

@@ -11,7 +11,7 @@ from bpy_extras import view3d_utils
 from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, draw, drive, override, picture, seen, view, waited
+from driving import FOLDER, clear, draw, drive, override, part, picture, seen, view, waited
 
 state = {}
 
@@ -50,13 +50,23 @@ def event(kind, value="NOTHING", move=(0, 0)):
     return True
 
 
+def send(*given):
+    """Return the step that simulates an event."""
+    return lambda: event(*given)
+
+
+HELD = (60, -4)
+hover, press = send("MOUSEMOVE"), send("LEFTMOUSE", "PRESS")
+let_go, keep = send("LEFTMOUSE", "RELEASE", HELD), send("RET", "PRESS", HELD)
+press_s, press_g = send("S", "PRESS", HELD), send("G", "PRESS", HELD)
+
+
 def sessions():
-    return sys.modules[f"{KEY}.bend.session"]._open
+    return part("bend.session")._open
 
 
 def open_result():
-    for thing in list(bpy.data.objects):
-        bpy.data.objects.remove(thing)
+    clear()
     with override():
         bpy.ops.limber.open_result(directory=str(FOLDER / "beam.branch"))
     view()[1].spaces.active.region_3d.view_perspective = "ORTHO"
@@ -89,16 +99,8 @@ def is_loaded_at_grasp():
     return is_loaded(0.4)
 
 
-def hover():
-    return event("MOUSEMOVE")
-
-
-def press():
-    return event("LEFTMOUSE", "PRESS")
-
-
 def drag():
-    return waited(0.1) and event("MOUSEMOVE", move=(60, -4))
+    return waited(0.1) and event("MOUSEMOVE", move=HELD)
 
 
 def is_bent():
@@ -126,14 +128,6 @@ def is_over():
     return colour() == "limber_limit"
 
 
-def let_go():
-    return event("LEFTMOUSE", "RELEASE", move=(60, -4))
-
-
-def keep():
-    return event("RET", "PRESS", move=(60, -4))
-
-
 def is_kept():
     if sessions():
         return False
@@ -145,14 +139,6 @@ def is_kept():
     seen["colour_after"] = colour()
     seen["motion_shown"] = surface().modifiers["Limber motion"].show_viewport
     return True
-
-
-def press_s():
-    return event("S", "PRESS", move=(60, -4))
-
-
-def press_g():
-    return event("G", "PRESS", move=(60, -4))
 
 
 def is_refused():
@@ -168,7 +154,7 @@ def is_kept_as(name):
             return False
         plan = bpy.context.scene.limber.plan
         seen[name] = [getattr(plan, f"use_{name}"), list(getattr(plan, name))]
-        ball = sys.modules[f"{KEY}.plan.goal_ball"].of(bpy.data.collections["beam"])
+        ball = part("plan.goal_ball").of(bpy.data.collections["beam"])
         seen["ball"] = list(ball.location)
         return True
     return step
@@ -179,10 +165,6 @@ def undo():
         bpy.ops.ed.undo()
     seen["after_undo"] = bpy.context.scene.limber.simulate.use_move
     return True
-
-
-def escape():
-    return event("ESC", "PRESS")
 
 
 def is_left():
@@ -208,7 +190,7 @@ def blow():
 
 def is_loaded_down():
     """Cut at the top, with a fruit in the wind: it is bent, what is cut off is hidden."""
-    lines = sys.modules[f"{KEY}.bend.live_loads"].lines
+    lines = part("bend.live_loads").lines
     if len(lines) < 3 or "Limber cut" not in surface().modifiers:
         return False
     bent = max((now - then).length for now, then in zip(tip()[1], state["before"], strict=True))
@@ -232,4 +214,4 @@ drive([open_result, begin, is_loaded, hover, press, drag, is_bent, limit, is_ove
        begin, is_loaded_at_grasp, hover, press, drag, is_bent, let_go, press_s, is_kept_as("start"),
        begin, is_loaded_at_grasp, hover, press, drag, is_bent, let_go, press_g, is_kept_as("goal"),
        picture("goal"), begin, is_loaded, key("F", 0.3), key("C", 0.45), blow,
-       is_loaded_down, picture("loads"), escape, is_whole, is_left], longest=180)
+       is_loaded_down, picture("loads"), send("ESC", "PRESS"), is_whole, is_left], longest=180)

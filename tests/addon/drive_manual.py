@@ -9,37 +9,16 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, view, waited
+import driving
+from driving import FOLDER, clear, drive, override, picture, start, view
 
 BENT, MOST_PULLED = 14, 73
-
-
-def jobs():
-    return sys.modules[f"{KEY}.jobs.jobs"]
 
 
 def begin():
     clear()
     system = bpy.context.preferences.system
     system.viewport_aa, system.use_overlay_smooth_wire = "8", True
-    return True
-
-
-def open_example():
-    with override():
-        bpy.ops.limber.open_example("INVOKE_DEFAULT", directory=str(FOLDER))
-    return True
-
-
-def is_open():
-    return "bending_branch" in bpy.data.collections and not jobs().is_running() and waited(1.5)
-
-
-def save():
-    """Beside the example: its folder is shown relative to the file, not where this machine has it.
-    """
-    with override():
-        bpy.ops.wm.save_as_mainfile(filepath=str(FOLDER / "manual.blend"))
     return True
 
 
@@ -61,12 +40,6 @@ def see(graph, scalar, frame, *groups):
     return step
 
 
-def replay():
-    with override():
-        bpy.ops.limber.replay_pull("INVOKE_DEFAULT", pull="pull-1")
-    return True
-
-
 def render_wood():
     """The picture that Set Up Picture makes, in wood, at the end of the motion."""
     current = bpy.context.scene
@@ -84,12 +57,13 @@ def render_wood():
 
 
 def is_replayed():
-    return bpy.data.objects.get("Measured point 1") is not None and not jobs().is_running() and (
-        waited(1.5))
+    return "Measured point 1" in bpy.data.objects and driving.is_example_open()
 
 
-drive([begin, is_tab_open, open_example, is_open, save,
+drive([begin, driving.is_tab_open, start("open_example", directory=str(FOLDER)),
+       driving.is_example_open, driving.save(FOLDER / "manual.blend"),
        see("energy", "stress_over_strength", BENT, "energy"), picture("stress"),
        see("young", "young", 1), picture("young"),
-       replay, is_replayed, see("force", "residual", MOST_PULLED), picture("pull"),
+       start("replay_pull", pull="pull-1"), is_replayed,
+       see("force", "residual", MOST_PULLED), picture("pull"),
        render_wood], longest=100)

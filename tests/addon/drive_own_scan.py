@@ -8,11 +8,10 @@ import sys
 from pathlib import Path
 
 import bpy
-from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
 import mouse
-from driving import FOLDER, drive, part, picture, seen, view, waited
+from driving import FOLDER, drive, part, picture, seen, waited
 
 
 def browser(kind):
@@ -64,15 +63,9 @@ def is_made():
     return True
 
 
-def point_at_grasp():
-    branch = bpy.data.collections["scan"]
-    grasp = next(thing for thing in branch.objects if thing.name.startswith("Grasp"))
-    _, area, region = view()
-    place = view3d_utils.location_3d_to_region_2d(
-        region, area.spaces.active.region_3d, grasp.matrix_world.translation)
-    mouse.at.update(x=region.x + place.x, y=region.y + place.y)
-    mouse.event("MOUSEMOVE")
-    return waited(0.3)
+def grasp_place():
+    return next(thing for thing in bpy.data.collections["scan"].objects
+                if thing.name.startswith("Grasp")).matrix_world.translation
 
 
 def goal():
@@ -116,7 +109,7 @@ steps = [
     mouse.click, is_chosen, point_at_import, picture("chosen"), mouse.click, is_imported,
     picture("scan"),
     mouse.find("reconstruct"), mouse.click, is_made, picture("branch"),
-    point_at_grasp, mouse.press, drag, picture("goal"), mouse.let_go, is_goal_set,
+    mouse.point_at(grasp_place), mouse.press, drag, picture("goal"), mouse.let_go, is_goal_set,
     mouse.find("plan")]
 if (FOLDER / "plan").exists():
     # It takes minutes.

@@ -12,7 +12,8 @@ from types import SimpleNamespace
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, drive, is_tab_open, override, part, picture, seen, view, waited
+import driving
+from driving import FOLDER, drive, is_tab_open, part, picture, seen, start, view
 
 DRAWN_ERRORS = 30
 
@@ -103,24 +104,6 @@ def header_of(kind):
     return draw
 
 
-def open_example():
-    with override():
-        bpy.ops.limber.open_example("INVOKE_DEFAULT", directory=str(FOLDER / "copy"))
-    return True
-
-
-def is_open():
-    return "bending_branch" in bpy.data.collections and not part("jobs.jobs").is_running() and (
-        waited(1.0))
-
-
-def save():
-    """Beside the example: its folder is then shown relative to the file."""
-    with override():
-        bpy.ops.wm.save_as_mainfile(filepath=str(FOLDER / "copy" / "panels.blend"))
-    return True
-
-
 def all_settings():
     scene = bpy.context.scene.limber
     scene.show_expert = True
@@ -176,5 +159,6 @@ def draw_too_wide(layout, _context):
 
 
 drive([begin, is_tab_open, show("cut", draw_too_wide), picture("cut"),
-       *each_panel("start"), open_example, is_open, save,
+       *each_panel("start"), start("open_example", directory=str(FOLDER / "copy")),
+       driving.is_example_open, driving.save(FOLDER / "copy" / "panels.blend"),
        all_settings, fail, *each_panel("all"), *errors(), measure_errors], longest=60)

@@ -11,17 +11,17 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, seen
+from driving import FOLDER, clear, drive, is_tab_open, override, part, picture, seen, start, undo
 
 state = {}
 
 
 def skeleton():
-    return sys.modules[f"{KEY}.branch.branches"].find_skeleton(bpy.context.scene)
+    return part("branch.branches").find_skeleton(bpy.context.scene)
 
 
 def marks():
-    return sys.modules[f"{KEY}.skeleton.node_marks"].marks_in_sight(skeleton())
+    return part("skeleton.node_marks").marks_in_sight(skeleton())
 
 
 def open_result():
@@ -58,7 +58,7 @@ def choose(*numbers):
 
 def edit():
     """A twig's tip is moved with G's operator, another twig hung elsewhere, a twig cut off."""
-    given = sys.modules[f"{KEY}.bridge.skeletons"].as_given(skeleton().data)
+    given = part("bridge.skeletons").as_given(skeleton().data)
     carried = [int(k) for k in np.flatnonzero(np.bincount(
         given.parent[given.parent >= 0], minlength=len(given.parent)) == 0)]
     seen["node_count"], seen["tips"] = len(given.parent), carried
@@ -80,26 +80,14 @@ def edit():
     return True
 
 
-def undo():
-    with override():
-        bpy.ops.ed.undo()
-    return True
-
-
 def undone():
     seen["after_undo"] = marks().edit_count
     seen["still_editing"] = skeleton().mode
     return True
 
 
-def apply():
-    with override():
-        bpy.ops.limber.apply_skeleton("INVOKE_DEFAULT")
-    return True
-
-
 def applied():
-    if sys.modules[f"{KEY}.jobs.jobs"].is_running():
+    if part("jobs.jobs").is_running():
         return False
     thing = skeleton()
     if thing is None or marks().edit_count or not len(marks().points["edited"]):
@@ -109,5 +97,5 @@ def applied():
     return True
 
 
-drive([open_result, open_tab, edit, picture("edited"), undo, undone, apply, applied,
-       picture("applied")], longest=200)
+drive([open_result, open_tab, edit, picture("edited"), undo, undone, start("apply_skeleton"),
+       applied, picture("applied")], longest=200)

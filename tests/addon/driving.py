@@ -60,6 +60,26 @@ def start(operator, **keywords):
     return step
 
 
+def undo():
+    with override():
+        bpy.ops.ed.undo()
+    return True
+
+
+def is_example_open():
+    return "bending_branch" in bpy.data.collections and not part("jobs.jobs").is_running() and (
+        waited(1.0))
+
+
+def save(path):
+    """Return the step that saves: beside a branch its folder is shown relative to the file."""
+    def step():
+        with override():
+            bpy.ops.wm.save_as_mainfile(filepath=str(path))
+        return True
+    return step
+
+
 def override(kind="WINDOW"):
     window, area, region = view(kind)
     return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)

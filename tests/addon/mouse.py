@@ -6,6 +6,7 @@ not.
 """
 
 import bpy
+from bpy_extras.view3d_utils import location_3d_to_region_2d
 from driving import draw, seen, started, view, waited
 
 STEP_PIXELS = 9
@@ -86,6 +87,17 @@ def find(operator):
         event("MOUSEMOVE")
         return False
     step.__name__ = f"find {operator}"
+    return step
+
+
+def point_at(find_place):
+    """Return the step that moves the mouse to a place of the world in the view."""
+    def step():
+        _, area, region = view()
+        place = location_3d_to_region_2d(region, area.spaces.active.region_3d, find_place())
+        at.update(x=region.x + place.x, y=region.y + place.y)
+        event("MOUSEMOVE")
+        return waited(0.3)
     return step
 
 

@@ -3,6 +3,7 @@
 import importlib
 
 import pytest
+from tests.addon.conftest import part
 
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_points
@@ -51,7 +52,7 @@ def test_selected_points_give_the_box(bpy, scan):
 def test_deleted_points_are_left_out(bpy, scan, tmp_path):
     """By their numbers in the file, in its own digits; restored, none is given any more."""
     bmesh = importlib.import_module("bmesh")
-    deleted = importlib.import_module("limber_addon.scan.deleted_points")
+    deleted = part("scan.deleted_points")
     source = tmp_path / "twig.xyz"
     assert deleted.write(bpy.context.scene, source) is None
     bpy.context.view_layer.objects.active = scan

@@ -1,12 +1,12 @@
 """Which branch is meant: panels, steps and sessions all ask once, and get the one in sight."""
 
-import importlib
 import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from tests.addon.conftest import part
 from tests.addon.test_panels import Layout
 
 from limber.cli.main import call
@@ -14,10 +14,6 @@ from limber.cli.main import call
 pytestmark = pytest.mark.usefixtures("worker_here")
 
 BLEND_FILES = Path(__file__).parents[2] / "blend_files"
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
 
 
 def _targets(folder):

@@ -1,20 +1,15 @@
 """An error of the worker in the panel: a short sentence, a button for each choice, a mark."""
 
-import importlib
 import json
 import re
 import sys
 
 import pytest
 from tests.addon.catalogue import told
+from tests.addon.conftest import part
 from tests.addon.test_panels import Layout, _draw_step
 
 from limber.core.errors import Command, InputError, Option, Text
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
-
 
 ERROR = InputError(
     "The scan contains two plants.", "A branch belongs to one plant.", "Crop the scan (",

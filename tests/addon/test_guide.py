@@ -1,12 +1,11 @@
 """Each panel's help: a page of the guide that is there, in a checkout and in the zip."""
 
-import importlib
 import subprocess
 import sys
 from html.parser import HTMLParser
 
 import pytest
-from tests.addon.conftest import ROOT
+from tests.addon.conftest import ROOT, part
 
 
 class Links(HTMLParser):
@@ -34,8 +33,8 @@ def pages(tmp_path_factory):
 
 def test_every_panel_has_a_page(bpy, registered, pages):
     """The button in each panel's header opens a page that the checkout and the zip have."""
-    guide = importlib.import_module("limber_addon.panels.guide")
-    steps = importlib.import_module("limber_addon.jobs.steps").STEPS
+    guide = part("panels.guide")
+    steps = part("jobs.steps").STEPS
     names = {*guide._PAGES.values(), *(step.page for step in steps), "index"}
     assert len(names) > 8
     for name in names:

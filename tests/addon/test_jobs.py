@@ -10,11 +10,12 @@ import textwrap
 import time
 
 import pytest
+from tests.addon.conftest import part
 
 
 @pytest.fixture()
 def jobs(addon):
-    module = importlib.import_module("limber_addon.jobs.jobs")
+    module = part("jobs.jobs")
     yield module
     module.forget()
 
@@ -182,7 +183,7 @@ def test_forget_ends_the_worker(jobs, tmp_path):
 
 def test_finding_the_worker(addon, tmp_path, monkeypatch):
     """Preferences, LIMBER_PYTHON, this Python, the PATH, in this order; else a helpful error."""
-    worker = importlib.import_module("limber_addon.jobs.worker")
+    worker = part("jobs.worker")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("LIMBER_PYTHON", raising=False)
     with pytest.raises(worker.WorkerNotFound, match="preferences"):
@@ -203,7 +204,7 @@ def test_finding_the_worker(addon, tmp_path, monkeypatch):
 
 def test_worker_environment_is_not_blenders(addon, monkeypatch):
     """Blender's PYTHONHOME and PYTHONPATH do not reach the worker's Python."""
-    worker = importlib.import_module("limber_addon.jobs.worker")
+    worker = part("jobs.worker")
     monkeypatch.setenv("PYTHONHOME", "/blender")
     monkeypatch.setenv("PYTHONPATH", "/blender")
     environment = worker.worker_environment()
@@ -213,7 +214,7 @@ def test_worker_environment_is_not_blenders(addon, monkeypatch):
 
 def test_the_worker_of_the_extensions_own_wheels(addon, tmp_path, monkeypatch):
     """It runs in this Python, and so does all that it starts; a Python that was chosen wins."""
-    worker = importlib.import_module("limber_addon.jobs.worker")
+    worker = part("jobs.worker")
     monkeypatch.delenv("LIMBER_PYTHON", raising=False)
     package = tmp_path / "limber"
     (package / "cli").mkdir(parents=True)

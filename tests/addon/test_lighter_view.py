@@ -1,13 +1,13 @@
 """A slowly drawn view loses its anti-aliasing for the time of a grab, a fast one does not."""
 
-import importlib
 
 import pytest
+from tests.addon.conftest import part
 
 
 @pytest.fixture()
 def view(bpy, addon):
-    module = importlib.import_module("limber_addon.bend.lighter_view")
+    module = part("bend.lighter_view")
     bpy.context.preferences.system.viewport_aa = "8"
     bpy.context.preferences.is_dirty = False
     return module.LighterView(bpy.context.preferences)

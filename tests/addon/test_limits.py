@@ -1,15 +1,15 @@
 """The limits of a plan while the branch is held: shares, colours, and colours that come back."""
 
-import importlib
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 
 @pytest.fixture()
 def limits(worker_here):
-    return importlib.import_module("limber_addon.bend.limits")
+    return part("bend.limits")
 
 
 def test_only_limits_that_are_set_count(bpy, limits):
@@ -38,16 +38,15 @@ def test_colours_go_from_green_to_red(limits):
 def test_the_branch_is_red_beyond_a_limit_and_gets_its_colours_back(bpy, limits, beam):
     """Whatever it was coloured by; turning it on or off twice is nothing."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
-    branches = importlib.import_module("limber_addon.branch.branches")
+    branches = part("branch.branches")
     surface = branches.find_surface(bpy.context.scene)
     bpy.ops.limber.color_by(scalar="strain_energy")
     tint, attributes = limits.Tint(surface), surface.data.color_attributes
     for _ in range(2):
         tint.show(True)
         assert attributes.active_color.name == "limber_limit"
-        values = np.empty(4 * len(surface.data.vertices), np.float32)
-        attributes.active_color.data.foreach_get("color", values)
-        assert (values.reshape(-1, 4)[:, 0] > 10 * values.reshape(-1, 4)[:, 1]).all()
+        values = part("bridge.meshes").values_of(surface.data, "limber_limit")
+        assert (values[:, 0] > 10 * values[:, 1]).all()
     for _ in range(2):
         tint.show(False)
         assert attributes.active_color.name == "strain_energy_color"
@@ -56,7 +55,7 @@ def test_the_branch_is_red_beyond_a_limit_and_gets_its_colours_back(bpy, limits,
 
 def test_the_frame_rate_is_that_of_the_last_second(addon):
     """Thirty in a second; none a second later."""
-    rate = importlib.import_module("limber_addon.bend.frame_rate").FrameRate()
+    rate = part("bend.frame_rate").FrameRate()
     for number in range(60):
         rate.tick(10.0 + number / 30)
     assert rate.per_second(10.0 + 59 / 30) == 30

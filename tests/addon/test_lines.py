@@ -1,14 +1,14 @@
 """Texts in lines as wide as the sidebar."""
 
-import importlib
 from types import SimpleNamespace
 
 import pytest
+from tests.addon.conftest import part
 
 
 @pytest.fixture()
 def lines(addon):
-    return importlib.import_module("limber_addon.panels.lines")
+    return part("panels.lines")
 
 
 def test_no_line_is_wider_than_there_is_room(lines):
@@ -53,14 +53,14 @@ def test_what_does_not_fit_beside_stands_above(bpy, lines):
     (60000000.0, "6e+07"), (0.1, "0.1"), (900.0, "900.0"), (123456.0, "123456.0"), (3, "3")])
 def test_numbers_are_short(addon, value, text):
     """As short as their single precision allows, and the same number again."""
-    number_text = importlib.import_module("limber_addon.jobs.stages").number_text
+    number_text = part("jobs.stages").number_text
     assert number_text(value) == text
     assert float(text) == value
 
 
 def test_an_error_beside_the_mouse_fits_the_screen(lines):
     """In lines in a window; a script gets the worker's text as it is."""
-    operator = importlib.import_module("limber_addon.jobs.worker_operator").WorkerOperator
+    operator = part("jobs.worker_operator").WorkerOperator
     text = "The scan contains two plants, and a branch belongs to one plant alone. " * 5
     context, told = SimpleNamespace(window=SimpleNamespace(width=1280)), []
     for is_beside in (True, False):

@@ -1,6 +1,5 @@
 """What a user's actions do, from the bpy package: errors are clear, results are right."""
 
-import importlib
 import shutil
 import struct
 import sys
@@ -9,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 from limber.core.files.atomic import file_digest
 from limber.geometry.cloud.preparation import LONGEST
@@ -42,7 +42,7 @@ def _text(path, delimiter, header):
 ])
 def test_import_cloud(bpy, registered, tmp_path, name, write):
     """Every kind of file shows its points, in metres, and proposes a branch folder beside it."""
-    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    meshes = part("bridge.meshes")
     write(tmp_path / name)
     settings = bpy.context.scene.limber
     settings.reconstruct.unit = "mm"
@@ -67,7 +67,7 @@ def test_columns_are_read_as_the_worker_reads_them(bpy, registered, tmp_path, te
     """Coordinates by the header's names, in whatever order; no other column, no unit guessed."""
     path = tmp_path / "scan.csv"
     path.write_text(text, encoding="utf-8")
-    points, *_ = importlib.import_module("limber_addon.scan.clouds").read_points(path)
+    points, *_ = part("scan.clouds").read_points(path)
     np.testing.assert_allclose(points, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     np.testing.assert_allclose(points, read_cloud(path).points)
     bpy.ops.limber.import_cloud(filepath=str(path))
@@ -83,7 +83,7 @@ def test_the_units_and_files_of_other_programs(bpy, registered, tmp_path, name, 
     """A unit that the file states is set, and the points are the worker's."""
     path = tmp_path / name
     path.write_text(text)
-    points, *_ = importlib.import_module("limber_addon.scan.clouds").read_points(path)
+    points, *_ = part("scan.clouds").read_points(path)
     np.testing.assert_allclose(points * {"m": 1.0, "mm": 1e-3}[unit], read_cloud(path).points)
     bpy.ops.limber.import_cloud(filepath=str(path))
     assert bpy.context.scene.limber.reconstruct.unit == unit
@@ -92,7 +92,7 @@ def test_the_units_and_files_of_other_programs(bpy, registered, tmp_path, name, 
 @pytest.mark.parametrize("name", ["realsense_ascii_normals.ply", "metashape.txt", "polycam.ply"])
 def test_a_scan_has_the_workers_colours(bpy, registered, name):
     path = Path(__file__).parents[1] / "data" / "tour" / name
-    points, _, colours = importlib.import_module("limber_addon.scan.clouds").read_points(path)
+    points, _, colours = part("scan.clouds").read_points(path)
     read = read_cloud(path)
     np.testing.assert_allclose(points, read.points, atol=1e-9)
     np.testing.assert_array_equal(colours, read.attributes["color"])
@@ -102,32 +102,23 @@ def test_a_scan_has_the_workers_colours(bpy, registered, name):
         bpy.ops.limber.import_cloud(filepath="")
 
 
-def test_lines_of_different_length_are_refused(bpy, registered, tmp_path):
-    """COLMAP's points have a track behind them, and their number first: no x."""
-    path = tmp_path / "points3D.txt"
-    path.write_text("# POINT3D_ID, X, Y, Z, TRACK[]\n7 0.1 0.2 0.3 1 5\n900 0.4 0.5 0.6 1\n")
-    with pytest.raises(RuntimeError, match="line 3 has 5 values, but the first line has 6"):
-        bpy.ops.limber.import_cloud(filepath=str(path))
-
-
-def test_a_header_without_coordinates_is_refused(bpy, registered, tmp_path):
-    """No other column is taken for one."""
-    path = tmp_path / "scan.csv"
-    path.write_text("id,row,column\n0,1,2\n1,2,3\n")
-    with pytest.raises(RuntimeError, match=r"has the columns id, row, column\. x, y and z"):
-        bpy.ops.limber.import_cloud(filepath=str(path))
-    assert not bpy.data.objects
-
-
-@pytest.mark.parametrize("content", [
-    b"", b"ply\nformat ascii 1.0\n", b"1 2 nan\n", b"a b c\nd e f\n",
-    b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\n"
-    b"property float y\nproperty float z\nend_header\nxx"])
-def test_bad_clouds_are_refused(bpy, registered, tmp_path, content):
-    """An empty, truncated or non-numeric file is an error that names it; nothing is added."""
+@pytest.mark.parametrize(("content", "why"), [
+    (b"", ""), (b"ply\nformat ascii 1.0\n", ""), (b"1 2 nan\n", ""), (b"a b c\nd e f\n", ""),
+    (b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\n"
+     b"property float y\nproperty float z\nend_header\nxx", ""),
+    # No memory is taken for what a header only claims.
+    (b"ply\nformat binary_little_endian 1.0\nelement vertex 900000000000\n"
+     b"property float x\nproperty float y\nproperty float z\nend_header\n1234", ""),
+    # COLMAP's points have a track behind them, and their number first: no x.
+    (b"# POINT3D_ID, X, Y, Z, TRACK[]\n7 0.1 0.2 0.3 1 5\n900 0.4 0.5 0.6 1\n",
+     "line 3 has 5 values, but the first line has 6"),
+    (b"id,row,column\n0,1,2\n1,2,3\n", r"has the columns id, row, column\. x, y and z")])
+def test_bad_clouds_are_refused(bpy, registered, tmp_path, content, why):
+    """An empty, truncated or foreign file is an error that names it; nothing is added, and no
+    other column is taken for a coordinate."""
     for name in ("bad.ply", "bad.xyz"):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(RuntimeError, match=name):
+        with pytest.raises(RuntimeError, match=f"{name}.*{why if name == 'bad.xyz' else ''}"):
             bpy.ops.limber.import_cloud(filepath=str(tmp_path / name))
     assert not bpy.data.objects
 
@@ -140,7 +131,7 @@ def test_reconstruct_wants_a_scan(bpy, registered):
 
 def test_reconstruct_hands_the_worker_what_the_user_chose(bpy, registered, tmp_path, monkeypatch):
     """The worker gets file, folder and unit; its error reaches the user as it is."""
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     seen = []
     start = jobs.start
     monkeypatch.setattr(jobs, "start", lambda title, command, _: seen.append(command) or start(
@@ -167,12 +158,6 @@ def test_open_result_and_play(bpy, registered, beam):
     assert scene.frame_end == 6
     assert bpy.ops.limber.open_result(directory=str(beam.folder)) == {"FINISHED"}
     assert [c.name for c in scene.collection.children] == ["beam"], "opened anew, not twice"
-
-
-def test_open_result_refuses_other_folders(bpy, registered, tmp_path):
-    """A folder without branch.json is refused before the worker is asked."""
-    with pytest.raises(RuntimeError, match=r"branch\.json"):
-        bpy.ops.limber.open_result(directory=str(tmp_path))
 
 
 @pytest.mark.slow
@@ -206,7 +191,7 @@ def test_color_by_refuses_unknown(bpy, worker_here, beam):
 def test_check_worker(bpy, registered):
     """The worker that is found answers."""
     assert bpy.ops.limber.check_worker() == {"FINISHED"}
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     assert jobs.current().result["command"] == "doctor"
 
 
@@ -255,7 +240,7 @@ def test_a_folder_belongs_to_its_scan(bpy, registered, tmp_path):
 
 def test_replacing_a_branch_has_to_be_said(bpy, registered, tmp_path, monkeypatch):
     """Reconstructing into the folder of another scan is refused unless it is asked for."""
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     started = []
     monkeypatch.setattr(jobs, "start", lambda title, command, _: started.append(command) or 1 / 0)
     one, two = _scan(tmp_path / "a.xyz", 1), _scan(tmp_path / "b.xyz", 2)
@@ -271,9 +256,9 @@ def test_replacing_a_branch_has_to_be_said(bpy, registered, tmp_path, monkeypatc
 
 def test_keywords_are_the_scenes_settings(bpy, registered, beam, monkeypatch):
     """What a script gives a stage is what the panels show, and what the worker gets."""
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     # The branch has no energy field: here it is not sampled first.
-    monkeypatch.delitem(importlib.import_module("limber_addon.jobs.steps").FIRST, "plan")
+    monkeypatch.delitem(part("jobs.steps").FIRST, "plan")
     started = []
     monkeypatch.setattr(jobs, "start", lambda title, command, _: started.append(command) or 1 / 0)
     with pytest.raises(RuntimeError, match="division"):
@@ -290,7 +275,7 @@ def test_keywords_are_the_scenes_settings(bpy, registered, beam, monkeypatch):
 @pytest.mark.slow
 def test_a_stage_runs_and_its_outcome_stays(bpy, registered, branch_folder):
     """The worker makes a report; its state is done; a failure and a warning are kept to be read."""
-    steps = importlib.import_module("limber_addon.panels.steps")
+    steps = part("panels.steps")
     scene = bpy.context.scene
     assert bpy.ops.limber.report(branch_folder=str(branch_folder)) == {"FINISHED"}
     assert (branch_folder / "report.html").is_file()
@@ -318,14 +303,14 @@ def test_places_come_from_the_cursor(bpy, registered):
 def test_import_stands_in_the_file_menu(bpy, registered):
     """File > Import has the scan, so that F3 finds it; and it goes with the add-on."""
     menu = bpy.types.TOPBAR_MT_file_import
-    imports = importlib.import_module("limber_addon.scan.import_cloud")
+    imports = part("scan.import_cloud")
     assert imports._draw_menu in menu._dyn_ui_initialize()
     assert bpy.types.LIMBER_FH_cloud.bl_import_operator == "limber.import_cloud"
 
 
 def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(bpy, registered, tmp_path):
     """From the worker's limit on: guessed and asked, unless the user has set the unit."""
-    limit = importlib.import_module("limber_addon.jobs.stages").longest_m()
+    limit = part("jobs.stages").longest_m()
     assert limit == LONGEST
     np.savetxt(tmp_path / "a.xyz", POINTS * 1.1 * limit / np.ptp(POINTS, axis=0).max())
     settings = bpy.context.scene.limber.reconstruct
@@ -337,8 +322,7 @@ def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(bpy, reg
         bpy.ops.limber.import_cloud(filepath=str(tmp_path / "a.xyz"))
         assert settings.unit == unit
     # The worker would ask for it again.
-    stages, properties = (importlib.import_module(f"limber_addon.{name}") for name in (
-        "jobs.stages", "properties"))
+    stages, properties = (part(name) for name in ("jobs.stages", "properties"))
     settings.output = "a.branch"
     typed = properties.arguments_of(bpy.context.scene, stages.stages()["reconstruct"], "a.branch")
     assert typed[typed.index("--unit") + 1] == "m"
@@ -346,13 +330,13 @@ def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(bpy, reg
 
 def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):
     """A scan in a map's coordinates: a millimetre is still there, and it comes to its branch."""
-    meshes = importlib.import_module("limber_addon.bridge.meshes")
-    scene = importlib.import_module("limber_addon.show.scene")
+    meshes = part("bridge.meshes")
+    scene = part("show.scene")
     points = np.array([[432100.001, 5412300.002, 512.003], [432100.501, 5412300.102, 513.0]])
     (tmp_path / "map.xyz").write_text("".join(f"{x} {y} {z}\n" for x, y, z in points))
     bpy.ops.limber.import_cloud(filepath=str(tmp_path / "map.xyz"))
     cloud = bpy.data.objects["map scan"]
-    branches = importlib.import_module("limber_addon.branch.branches")
+    branches = part("branch.branches")
     offset = np.array(cloud[branches.OFFSET_KEY])
     np.testing.assert_allclose(meshes.positions(cloud.data) + offset, points, rtol=0, atol=1e-6)
     alignment = np.eye(4)
@@ -365,20 +349,10 @@ def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):
     np.testing.assert_allclose(placed, points - points[0], rtol=0, atol=1e-5)
 
 
-def test_a_count_that_the_file_has_no_room_for(bpy, registered, tmp_path):
-    """No memory is taken for what a header only claims."""
-    clouds = importlib.import_module("limber_addon.scan.clouds")
-    path = tmp_path / "huge.ply"
-    path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 900000000000\n"
-                     b"property float x\nproperty float y\nproperty float z\nend_header\n1234")
-    with pytest.raises(ValueError, match="truncated"):
-        clouds.read_points(path)
-
-
 def test_a_job_that_blender_ends_is_no_failure(bpy, registered, tmp_path):
     """File > New while the worker works: the panel of the new file shows no failure."""
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
-    operators = importlib.import_module("limber_addon.jobs.worker_operator")
+    jobs = part("jobs.jobs")
+    operators = part("jobs.worker_operator")
     job = jobs.start("Working", [sys.executable, "-c", "import time; time.sleep(60)"])
     operators._beside.append(operators._Beside("limber.energy", job, {}, {}))
     bpy.ops.wm.read_homefile()

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from tests.addon.conftest import part
 
 from limber.stages.pulls.virtual_pull import VirtualPull
 from limber.store import Branch
@@ -134,7 +135,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("report", "limber.report", ("limber.open_report",))])
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, first, more):
     """Its stages' buttons in order, and every setting of the schema; the common ones at once."""
-    stages = importlib.import_module("limber_addon.jobs.stages").stages()
+    stages = part("jobs.stages").stages()
     drawn = _draw_step(bpy, name)
     shown = [call for call in drawn.names("operator") if call not in (
         "limber.from_cursor", "limber.from_object")]
@@ -161,7 +162,7 @@ def test_the_expert_settings_are_shown_on_demand(bpy, panels):
 @pytest.mark.slow
 def test_a_step_says_how_far_it_is(bpy, panels, branch_folder, small):
     """Not run, done, out of date by its input or its settings, failed; and what comes next."""
-    module = importlib.import_module("limber_addon.panels.steps")
+    module = part("panels.steps")
     scene = bpy.context.scene
 
     def state(name):
@@ -186,8 +187,8 @@ def test_a_step_says_how_far_it_is(bpy, panels, branch_folder, small):
         stage.path("skeleton.swc").write_text(
             (branch_folder / "skeleton.swc").read_text() + "# edited\n")
     assert state("virtual-pull") is module.StepState.STALE
-    properties = importlib.import_module("limber_addon.properties")
-    stages = importlib.import_module("limber_addon.jobs.stages").stages()
+    properties = part("properties")
+    stages = part("jobs.stages").stages()
     properties.keep_outcome(scene, stages["virtual-pull"], str(branch_folder),
                             {"status": "failed", "error": "It broke.", "warnings": ["It bent."]})
     assert state("virtual-pull") is module.StepState.FAILED
@@ -251,7 +252,7 @@ def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
     (False, 1.8, "BLANK1", "May break: stress 1.8 times the strength")])
 def test_a_path_that_breaks_the_wood_is_never_ticked(bpy, worker_here, over, stress, icon, warning):
     """What is proven of its cost stands without a tick, above what is wrong with it."""
-    comparing = importlib.import_module("limber_addon.panels.comparing")
+    comparing = part("panels.comparing")
     layout, path = Layout(), {"length_m": 0.1, "peak_strain": 0.007}
     comparing.draw_paths(layout, bpy.context, {
         "plan": path, "baseline": path, "certificate": {"gap_percent": 1.0},
@@ -267,7 +268,7 @@ def test_a_path_that_breaks_the_wood_is_never_ticked(bpy, worker_here, over, str
 @pytest.mark.slow
 def test_without_a_client_for_robots_there_is_no_robot(bpy, panels, whole_texts, monkeypatch):
     """As in the zips: neither the step nor Record, and one line that says why."""
-    preferences = importlib.import_module("limber_addon.preferences")
+    preferences = part("preferences")
     preferences._looked.clear()
 
     def shown():
@@ -276,10 +277,11 @@ def test_without_a_client_for_robots_there_is_no_robot(bpy, panels, whole_texts,
             for text in _draw_step(bpy, name).names("label")]
     is_there, before = shown()
     assert is_there and "Record a Pull" in before and not any("ur-rtde" in text for text in before)
-    worker = importlib.import_module("limber_addon.jobs.worker")
+    worker = part("jobs.worker")
     monkeypatch.setattr(preferences, "worker_command", worker.bundled_command)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, found=importlib.util.find_spec: (
         None if name == "rtde_control" else found(name)))
+    preferences._looked.clear()
     is_there, after = shown()
     assert not is_there and "Record a Pull" not in after
     layout = Layout()
@@ -302,7 +304,7 @@ def test_where_to_start(bpy, panels, beam):
 
 def test_jobs_that_wait_are_listed(bpy, panels):
     """What runs with its time and numbers, then what waits, each with its own cross."""
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     job = jobs.add("Estimating", [sys.executable, "-c", "import time; time.sleep(30)"])
     jobs.add("Planning", [sys.executable, "-c", ""])
     jobs.add("Reporting", [sys.executable, "-c", ""])
@@ -322,7 +324,7 @@ def test_jobs_that_wait_are_listed(bpy, panels):
 
 def test_a_running_and_a_failed_job(bpy, panels):
     """While the worker works: a bar and a cancel button; after a failure: why."""
-    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    jobs = part("jobs.jobs")
     job = jobs.start("Reconstructing", [sys.executable, "-c", (
         "import sys, time; print('{\"progress\": 0.25, \"message\": \"radii\"}', flush=True); "
         "time.sleep(30)")])
@@ -356,8 +358,8 @@ def test_no_worker_is_said_in_the_panel(bpy, panels, monkeypatch):
 
 def test_names_are_chosen_from_what_the_branch_has(bpy, panels, tmp_path):
     """Plans, motions and pulls are listed; all of them while one is chosen, else what fits."""
-    properties = importlib.import_module("limber_addon.properties")
-    stages = importlib.import_module("limber_addon.jobs.stages").stages()
+    properties = part("properties")
+    stages = part("jobs.stages").stages()
     scene = bpy.context.scene
     scene.limber.branch_folder = str(EXAMPLE)
 
@@ -379,7 +381,7 @@ def test_names_are_chosen_from_what_the_branch_has(bpy, panels, tmp_path):
 
 def test_every_choice_has_a_tooltip(bpy, panels):
     """Of every setting of every stage."""
-    stages = importlib.import_module("limber_addon.jobs.stages").stages()
+    stages = part("jobs.stages").stages()
     for stage in stages.values():
         group = getattr(bpy.context.scene.limber, stage.name.replace("-", "_"))
         for field in stage.fields.values():
@@ -391,8 +393,8 @@ def test_every_choice_has_a_tooltip(bpy, panels):
 def _change(content, scene, *, without=(), rewritten="", ended=(), queued="", folder="",
             **settings):
     """Bring folder, settings, outcomes and queue into a state."""
-    for part in ("stages", "files"):
-        content[part] = {name: entry for name, entry in content[part].items()
+    for kind in ("stages", "files"):
+        content[kind] = {name: entry for name, entry in content[kind].items()
                          if not name.startswith(tuple(without) or "-")}
     if rewritten:
         content["stages"][content["files"][rewritten]["stage"]]["finished"] = "2100-01-01"
@@ -404,11 +406,11 @@ def _change(content, scene, *, without=(), rewritten="", ended=(), queued="", fo
         setattr(group, name, value)
     if ended:
         name, status = ended
-        stage = importlib.import_module("limber_addon.jobs.stages").stages()[name]
-        importlib.import_module("limber_addon.properties").keep_outcome(
+        stage = part("jobs.stages").stages()[name]
+        part("properties").keep_outcome(
             scene, stage, scene.limber.branch_folder, {"status": status, "error": "It broke."})
     if queued:
-        jobs = importlib.import_module("limber_addon.jobs.jobs")
+        jobs = part("jobs.jobs")
         jobs._waiting.append(jobs.Job(queued, [], folder or scene.limber.branch_folder))
 
 
@@ -428,7 +430,7 @@ def test_the_next_step_is_a_button_in_thirty_states(bpy, panels, tmp_path):
         found.append(next((name.removeprefix("limber.") for kind, name, *title in
                            _draw(panels("result"), bpy.context).calls
                            if kind == "operator" and str(title[:1]).startswith("['Next: ")), None))
-        importlib.import_module("limber_addon.jobs.jobs")._waiting.clear()
+        part("jobs.jobs")._waiting.clear()
         for group in ("estimate", "plan"):
             getattr(bpy.context.scene.limber, group).outcome = ""
     assert list(enumerate(found)) == list(enumerate(name for _, name in table))
@@ -441,7 +443,7 @@ def test_the_next_step_is_a_button_in_thirty_states(bpy, panels, tmp_path):
 def test_a_scan_is_reconstructed_next(bpy, registered, tmp_path):
     """Imported, it has no branch yet: that comes next. Nothing does where neither is there, or
     where it failed."""
-    steps = importlib.import_module("limber_addon.panels.steps")
+    steps = part("panels.steps")
     scene = bpy.context.scene
     assert steps.next_stage(scene) is None
     (tmp_path / "twig.xyz").write_text("0 0 0\n0 0 0.1\n0 0 0.2\n")

@@ -1,20 +1,16 @@
 """Set Up Picture: what is framed, in which colours; and a plan over the strength is not ticked."""
 
-import importlib
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 from tests.addon.test_panels import _draw_step
 
 pytestmark = pytest.mark.usefixtures("worker_here", "whole_texts")
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
 
 
 @pytest.fixture()

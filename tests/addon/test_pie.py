@@ -1,9 +1,9 @@
 """The pie menu, and the tooltips of choices."""
 
-import importlib
 from types import SimpleNamespace
 
 import pytest
+from tests.addon.conftest import part
 from tests.addon.test_panels import Layout
 
 
@@ -27,7 +27,7 @@ def test_with_a_branch_it_goes_on(bpy, worker_here, bare_beam):
     """The next step, in the branch that is the current one; the colours."""
     bpy.ops.limber.open_result(directory=str(bare_beam.folder))
     layout = drawn(bpy)
-    following = importlib.import_module("limber_addon.panels.steps").next_stage(bpy.context.scene)
+    following = part("panels.steps").next_stage(bpy.context.scene)
     assert ("operator", f"limber.{following.name.replace('-', '_')}",
             f"Next: {following.label}") in layout.calls
     assert ("menu", "LIMBER_MT_colours", "Colour By") in layout.calls
@@ -36,7 +36,7 @@ def test_with_a_branch_it_goes_on(bpy, worker_here, bare_beam):
 
 def test_a_choice_has_a_tooltip_of_its_own(bpy, registered):
     """What the description says of it, where it says so choice by choice."""
-    stages = importlib.import_module("limber_addon.jobs.stages").stages()
+    stages = part("jobs.stages").stages()
     leaves = stages["reconstruct"].fields["leaves"]
     told = {choice: leaves.about(choice) for choice in leaves.choices}
     assert told["keep"] == "treat all points as wood."

@@ -1,8 +1,11 @@
 """Presets of sensors: they set what the stage that reads the sensor's data takes, with a source."""
 
-import importlib
+
+from types import SimpleNamespace
 
 import pytest
+from tests.addon.conftest import part
+from tests.addon.test_panels import Layout
 
 from limber.recordings.sensor_checks import SENSORS
 from limber.stages.registry import stage_class
@@ -51,17 +54,13 @@ def test_a_force_sensor(bpy, registered):
 
 def test_menus_offer_the_sensors_of_their_stage(bpy, registered):
     """Every sensor in one menu, its title as text, its values and source as tooltip."""
-    presets = importlib.import_module("limber_addon.jobs.presets")
+    presets = part("jobs.presets")
     offered = {}
     for stage in presets.SENSED:
-        class Layout:
-            def operator(self, name, text, stage=stage):
-                offered.setdefault(stage, []).append(text)
-                return type("Given", (), {})()
-        menu = getattr(bpy.types, presets.sensor_menu(stage))
-        menu.draw(type("Menu", (), {"layout": Layout(), "stage": stage})(), bpy.context)
+        menu, layout = getattr(bpy.types, presets.sensor_menu(stage)), Layout()
+        menu.draw(SimpleNamespace(layout=layout, stage=stage), bpy.context)
+        offered[stage] = [text for _, _, text in layout.calls]
     assert offered == {stage: [known.title for known in SENSORS.values() if known.stage == stage]
                        for stage in presets.SENSED}
-    given = type("Given", (), {"sensor": "ur5e"})()
-    text = presets.LIMBER_OT_sensor.description(bpy.context, given)
+    text = presets.LIMBER_OT_sensor.description(bpy.context, SimpleNamespace(sensor="ur5e"))
     assert "1.75 N" in text and "data sheet" in text

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from tests.addon.window import SharedBlender, colour_count, driven, require_screen
 
+from limber.cli.main import call
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.store import Branch
@@ -85,8 +87,6 @@ def test_the_worker_comes_along(blender, tmp_path):
 
 def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
     """`limber scene` by this Blender; the file opens in it and its frames are right."""
-    from limber.cli.main import call
-
     monkeypatch.setenv("LIMBER_SCENE_BLENDER", blender)
     scene = beam.folder.parent / "scene.blend"
     picture = scene.with_suffix(".png")
@@ -115,7 +115,8 @@ def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
 
 def test_interface(run, blender, environment, beam, tmp_path):
     """In a window: the tab opens, a job is cancelled by a click, a result opened by the worker
-    beside the interface, and played."""
+    beside the interface, and played. What is the user's stays meanwhile, after a stage, its undo
+    and its redo."""
     require_screen()
     slow = tmp_path / "slow_worker"
     slow.write_text("#!/bin/sh\necho '{\"progress\": 0.4, \"message\": \"slowly\"}'\n"
@@ -126,8 +127,13 @@ def test_interface(run, blender, environment, beam, tmp_path):
     assert seen["progress_seen"] == 0.4
     assert seen["cancelled"] == "cancelled"
     assert seen["opened"] == ["beam"]
-    assert seen["playing"] is True
-    assert 1 < seen["frame_after_play"] <= len(beam.frames)
+    assert seen["playing"] is True and 2 < seen["frame_after_play"] <= 90
+    assert seen["first_range"] == [1, len(beam.frames)]
+    assert seen["before"]["modifiers"] == ["MESH_CACHE", "SUBSURF"]
+    assert seen["before"]["range"] == [2, 90, 4]
+    for name in ("again", "simulated", "redone"):
+        assert seen[name] == seen["before"], name
+    assert (seen["simulated cache"], seen["undone cache"]) == ("mine.pc2", "to-goal.pc2")
     assert not Path(f"/proc/{seen['left_running']}").exists(), "closing Blender ends the worker"
     for name in ("tab", "job", "opened", "playing"):
         assert colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
@@ -148,22 +154,6 @@ def test_the_first_view(shared_blender, tmp_path):
     assert _coloured_count(tmp_path / "branch.png") > 1000
 
 
-def test_things_of_the_users_stay(shared_blender, beam, tmp_path):
-    """From Blender's start, with things of one's own: results of stages leave them, undone too."""
-    seen = shared_blender.driven("drive_own_things.py", tmp_path)
-    before = seen["before"]
-    assert seen["first_range"] == [1, len(beam.frames)]
-    assert before["modifiers"] == ["MESH_CACHE", "SUBSURF"] and before["materials"] == ["mine"]
-    # A target is a mark more, with a mesh.
-    assert seen["opened"] == before
-    assert seen["target target"] and seen["target"] == before | {"meshes": before["meshes"] + 1}
-    assert seen["simulated cache"] == "mine.pc2" and before["range"] == [2, 90, 4]
-    for name in ("simulated", "redone", "again"):
-        assert seen[name] | {"meshes": 0} == before | {"meshes": 0}
-    assert seen["simulated"]["meshes"] == seen["again"]["meshes"]
-    assert seen["undone cache"] == "to-goal.pc2"
-
-
 def test_a_picture_by_an_example(run, beam, tmp_path):
     """At factory start, beside the cube: the branch is in the picture; a failure has a code."""
     example = FOLDER.parents[1] / "addon" / "examples" / "colour_and_render.py"
@@ -179,8 +169,6 @@ def test_a_picture_by_an_example(run, beam, tmp_path):
 
 def _coloured_count(path: Path, part: tuple[int, ...] | None = (200, 200, 800, 690)) -> int:
     """Return how many pixels are in a strong colour: of the 3D view, left of the sidebar."""
-    from PIL import Image
-
     pixels = np.asarray(Image.open(path).convert("RGB").crop(part)).astype(int)
     return int((np.ptp(pixels, axis=2) > 90).sum())
 
@@ -225,8 +213,6 @@ def test_manual_pictures(run, blender, environment, tmp_path):
     kept = os.environ.get("LIMBER_MANUAL_PICTURES")
     if not kept:
         pytest.skip("for the manual: scripts/make_manual_pictures")
-    from PIL import Image
-
     require_screen()
     driven("drive_manual.py", blender, environment, tmp_path)
     Path(kept).mkdir(parents=True, exist_ok=True)
@@ -239,8 +225,6 @@ def test_manual_pictures(run, blender, environment, tmp_path):
 
 def _cropped(path: Path):
     """Return the picture of the 3D view and its sidebar; in all its colours, which mean numbers."""
-    from PIL import Image
-
     return Image.open(path).convert("RGB").crop((0, 28, 1056, 718))
 
 

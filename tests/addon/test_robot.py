@@ -1,6 +1,5 @@
 """A robot moves only when its plan was checked as it is and a name was typed; its force is seen."""
 
-import importlib
 import json
 import shutil
 import sys
@@ -8,14 +7,11 @@ import time
 from pathlib import Path
 
 import pytest
+from tests.addon.conftest import part
 
 from limber.store import Branch
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
 
 
 @pytest.fixture()

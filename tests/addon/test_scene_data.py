@@ -1,6 +1,5 @@
 """The add-on's reader of scene data: what fits is read, all else is refused with a reason."""
 
-import importlib
 import io
 import json
 import os
@@ -8,6 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 from limber.results.scene.animation import scene_data
 from limber.results.scene.colours import FORMAT
@@ -16,7 +16,7 @@ from limber.store import Branch
 
 @pytest.fixture()
 def reader(addon):
-    return importlib.import_module("limber_addon.show.scene_data")
+    return part("show.scene_data")
 
 
 @pytest.fixture()
@@ -124,6 +124,6 @@ def test_a_pipe_in_a_branch_folder_is_not_waited_for(addon, tmp_path):
     """Nobody writes to it: Blender would stand still at the next redraw."""
     for module, name, function in (("branch.branch_folder", "branch.json", "read_record"),
                                    ("plan.live_force", None, "read")):
-        part = importlib.import_module(f"limber_addon.{module}")
-        os.mkfifo(tmp_path / (name or part.FILE))
-        assert getattr(part, function)(tmp_path) is None
+        reader = part(module)
+        os.mkfifo(tmp_path / (name or reader.FILE))
+        assert getattr(reader, function)(tmp_path) is None

@@ -1,19 +1,15 @@
 """What is in sight and what its colours mean: each frame, rods, graphs, several branches."""
 
-import importlib
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 from limber.results.scene.animation import scene_data
 from limber.store import Branch
-
-
-def part(name):
-    return importlib.import_module(f"limber_addon.{name}")
 
 
 @pytest.fixture()
@@ -46,17 +42,15 @@ def test_colours_follow_the_motion(bpy, opened, beam):
     colours = []
     for frame in (0, 2, 5):
         scene.frame_set(1 + frame)
-        np.testing.assert_allclose(meshes.scalars(opened.data, "now"), _density(beam, frame),
+        np.testing.assert_allclose(meshes.values_of(opened.data, "now"), _density(beam, frame),
                                    rtol=1e-5, atol=1e-5)
         shown = opened.data.color_attributes.active_color
         assert shown.name == "now_color"
-        values = np.empty(4 * len(shown.data), np.float32)
-        shown.data.foreach_get("color", values)
-        colours.append(values.reshape(-1, 4)[opened.data.vertices[0].index, 0])
+        colours.append(meshes.values_of(opened.data, "now_color")[0, 0])
     assert colours[0] < colours[1] < colours[2], "the base: from dark to bright as it is bent"
     bpy.ops.limber.color_by(scalar="strain_energy")
     assert opened.data.color_attributes.active_color.name == "strain_energy_color"
-    np.testing.assert_allclose(meshes.scalars(opened.data, "strain_energy"), _density(beam, 5),
+    np.testing.assert_allclose(meshes.values_of(opened.data, "strain_energy"), _density(beam, 5),
                                rtol=1e-5)
 
 
@@ -86,13 +80,13 @@ def test_colours_of_each_frame_survive_closing_and_moving(bpy, opened, beam, tmp
     meshes, scene = part("bridge.meshes"), bpy.context.scene
     data = scene.objects["beam"].data
     scene.frame_set(6)
-    np.testing.assert_allclose(meshes.scalars(data, "now"), _density(beam, 5), rtol=1e-5)
+    np.testing.assert_allclose(meshes.values_of(data, "now"), _density(beam, 5), rtol=1e-5)
     (home / beam.folder.name / ".viewport" / "to-goal.npz").write_bytes(b"rubbish")
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=str(home / "scene.blend"))
     scene = bpy.context.scene
     scene.frame_set(3)
-    np.testing.assert_allclose(meshes.scalars(scene.objects["beam"].data, "now"),
+    np.testing.assert_allclose(meshes.values_of(scene.objects["beam"].data, "now"),
                                _density(beam, 5), rtol=1e-5)
     assert bpy.ops.limber.color_by(scalar="strain_energy", each_frame=True) == {"FINISHED"}
     active = scene.objects["beam"].data.color_attributes.active_color
@@ -186,8 +180,11 @@ def test_several_branches(bpy, show, beam, tmp_path):
     assert max(spans[0]) < min(spans[1])
     # Shown anew it stays where it was put.
     place = second.delta_location.x
-    second = show(copied)
-    assert second.delta_location.x == place > 0
+    assert show(copied) == second and second.delta_location.x == place > 0
+    marks = [thing for thing in bpy.data.objects if thing.name.startswith("Grasp 1")]
+    scene.frame_set(4)
+    assert abs(marks[1].matrix_world.translation.x - marks[0].matrix_world.translation.x) == (
+        pytest.approx(place, abs=1e-5))
     bpy.ops.limber.side_by_side(back=True)
     assert second.delta_location.x == 0
     with pytest.raises(RuntimeError, match="no branch 'third'"):

@@ -1,6 +1,5 @@
 """The add-on's end of a session: a branch held by the worker; what is refused is said."""
 
-import importlib
 import json
 import os
 import signal
@@ -9,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 SCRIPT = """
 import sys
@@ -19,7 +19,7 @@ sys.stdin.read()
 
 @pytest.fixture
 def session_module(addon):
-    return importlib.import_module("limber_addon.bend.session")
+    return part("bend.session")
 
 
 @pytest.fixture

@@ -1,16 +1,16 @@
 """The motion in other programs' files, the turntable, and the legend of the view."""
 
-import importlib
 import math
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 
 @pytest.fixture()
 def opened(bpy, worker_here, beam):
     bpy.ops.limber.open_result(directory=str(beam.folder))
-    return importlib.import_module("limber_addon.branch.branches").find_surface(bpy.context.scene)
+    return part("branch.branches").find_surface(bpy.context.scene)
 
 
 @pytest.mark.slow
@@ -68,7 +68,7 @@ def test_the_turntable_goes_round_and_sees_the_branch(bpy, opened):
 @pytest.mark.slow
 def test_the_legend_is_that_of_the_colours_shown(bpy, opened):
     """Its scale follows the button; the bar has a row a stop, in the colours of the screen."""
-    legend = importlib.import_module("limber_addon.show.legend")
+    legend = part("show.legend")
     assert legend.shown_scales(opened)[0]["title"] == "Young's modulus (assumed)"
     bpy.ops.limber.color_by(scalar="strain_energy")
     scale = legend.shown_scales(opened)[0]
@@ -82,7 +82,7 @@ def test_the_legend_is_that_of_the_colours_shown(bpy, opened):
 
 def test_a_scan_keeps_its_colours_and_gives_way_to_its_branch(bpy, registered, tmp_path):
     """Red, green and blue of a PLY file, as a screen has them; the switch hides the scan."""
-    overlay = importlib.import_module("limber_addon.scan.cloud_overlay")
+    overlay = part("scan.cloud_overlay")
     colours = np.random.default_rng(3).integers(0, 256, (50, 3)).astype("u1")
     rows = np.zeros(50, [(axis, "<f4") for axis in "xyz"] + [
         (name, "u1") for name in ("red", "green", "blue")])

@@ -1,14 +1,14 @@
 """What was done to a skeleton's nodes, as edits: each in its order, and what is none is refused."""
 
-import importlib
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 
 
 @pytest.fixture()
 def edits(addon):
-    return importlib.import_module("limber_addon.skeleton.skeleton_edits")
+    return part("skeleton.skeleton_edits")
 
 
 @pytest.fixture()

@@ -1,12 +1,12 @@
 """The skeleton edited in Blender and by the worker: what is done to its nodes is what comes out."""
 
-import importlib
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.addon.conftest import part
 from tests.addon.test_panels import Layout
 
 from limber.core.alignment import Alignment
@@ -23,16 +23,16 @@ def opened(bpy, registered, tmp_path):
     folder = tmp_path / "twig.branch"
     shutil.copytree(EXAMPLE, folder)
     bpy.ops.limber.open_result(directory=str(folder))
-    scene = importlib.import_module("limber_addon.branch.branches")
+    scene = part("branch.branches")
     return folder, lambda: scene.find_skeleton(bpy.context.scene)
 
 
 def _places(thing):
-    return importlib.import_module("limber_addon.bridge.meshes").positions(thing.data)
+    return part("bridge.meshes").positions(thing.data)
 
 
 def _move(thing, node, by):
-    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    meshes = part("bridge.meshes")
     places = meshes.positions(thing.data)
     places[node] += by
     meshes.set_positions(thing.data, places)
@@ -55,8 +55,8 @@ def test_edits_reach_the_mesh_and_are_marked(bpy, opened):
     assert bpy.ops.limber.edit_node(action="RADIUS", node=3, radius=0.012) == {"FINISHED"}
     bpy.ops.object.mode_set(mode="OBJECT")
     _move(skeleton(), 4, [0.001, 0.0, 0.0])
-    overlay = importlib.import_module("limber_addon.skeleton.node_marks")
-    skeletons = importlib.import_module("limber_addon.bridge.skeletons")
+    overlay = part("skeleton.node_marks")
+    skeletons = part("bridge.skeletons")
     marks = overlay.marks_of(skeletons.nodes_of(skeleton()), skeleton().data)
     assert (marks.edit_count, marks.trouble) == (3, "")
     assert len(marks.points["pending"]) == 2
@@ -87,8 +87,8 @@ def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_pat
     np.testing.assert_allclose(_places(skeleton())[5] - was, [0, 0.003, 0], atol=1e-6)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
-    skeletons = importlib.import_module("limber_addon.bridge.skeletons")
-    edits = importlib.import_module("limber_addon.skeleton.skeleton_edits")
+    skeletons = part("bridge.skeletons")
+    edits = part("skeleton.skeleton_edits")
     done = edits.edits_of(skeletons.as_given(skeleton().data), skeletons.nodes_of(skeleton()))
     assert [edit["do"] for edit in done] == ["move", "confirm"]
     assert bpy.ops.limber.discard_skeleton() == {"FINISHED"}
@@ -110,7 +110,7 @@ def test_an_alternative_has_a_button(bpy, opened):
                             {"probability": 0.25, "length_m": 0.4,
                              "edits": [{"do": "delete", "at": tip}]}]
     path.write_text(json.dumps(content))
-    panel = importlib.import_module("limber_addon.skeleton.panel_parts")
+    panel = part("skeleton.panel_parts")
     assert panel.alternative_text(*made["alternatives"]) == (
         "0.5 times as likely, 400 mm: 1 branch less")
     drawn = Layout()
@@ -142,7 +142,7 @@ def test_what_does_not_fit_is_said_and_nothing_is_lost(bpy, opened):
     with pytest.raises(RuntimeError, match="cycle"):
         bpy.ops.limber.apply_skeleton()
     assert (folder / "skeleton.csv").read_bytes() == before
-    skeletons = importlib.import_module("limber_addon.bridge.skeletons")
+    skeletons = part("bridge.skeletons")
     assert skeletons.nodes_of(skeleton()).marks.sum() == 1
     bpy.ops.limber.edit_node(action="NONE", node=1)
     assert skeletons.nodes_of(skeleton()).marks.sum() == 0
@@ -153,7 +153,7 @@ def test_loads_and_exports_have_a_button(bpy, opened, tmp_path):
     """A fruit and a cut at the 3D cursor: the answer stays with the button. A file is written."""
     folder, _ = opened
     axes = read_skeleton(folder / "skeleton.csv")
-    steps = importlib.import_module("limber_addon.panels.steps")
+    steps = part("panels.steps")
     # Not the last section alone: that hangs on nodes of the one before.
     twig = np.flatnonzero(axes.branch == 1)
     for field, node in (("cut", twig[len(twig) // 2]), ("fruit", 40), ("fruit", 60)):
@@ -162,8 +162,8 @@ def test_loads_and_exports_have_a_button(bpy, opened, tmp_path):
     assert bpy.context.scene.limber.load.fruit.count(";") == 1
     assert bpy.ops.limber.load() == {"FINISHED"}
     assert steps.state_of(bpy.context.scene, "load")[0] is steps.StepState.DONE
-    properties = importlib.import_module("limber_addon.properties")
-    stages = importlib.import_module("limber_addon.jobs.stages").stages()
+    properties = part("properties")
+    stages = part("jobs.stages").stages()
 
     def told(name):
         # The branch folder knows nothing of it: what was said stays with the button.

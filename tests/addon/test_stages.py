@@ -1,10 +1,9 @@
 """The schema that the add-on ships: it is the worker's, and gives the worker's command lines."""
 
-import importlib
 import json
 
 import pytest
-from tests.addon.conftest import ADDON
+from tests.addon.conftest import ADDON, part
 from tests.stages.test_registry import NAMES, parsed, sample
 
 from limber.core.json_values import plain
@@ -13,7 +12,7 @@ from limber.stages.registry import all_schemas
 
 @pytest.fixture()
 def stages(addon):
-    return importlib.import_module("limber_addon.jobs.stages").stages()
+    return part("jobs.stages").stages()
 
 
 def test_the_shipped_schema_is_the_workers():
@@ -25,7 +24,7 @@ def test_the_shipped_schema_is_the_workers():
 def test_every_stage_has_its_place_in_the_add_on(stages):
     """A new stage stands in a step, with a label; `generate` makes no branch, and `scene` draws
     what `limber.open_result` does."""
-    steps = {step.name for step in importlib.import_module("limber_addon.jobs.steps").STEPS}
+    steps = {step.name for step in part("jobs.steps").STEPS}
     assert {stage.name for stage in stages.values() if not stage.step} == {"generate", "scene"}
     assert {stage.step for stage in stages.values()} <= {*steps, ""}
     assert all(bool(stage.label) == bool(stage.step) for stage in stages.values())
@@ -45,7 +44,7 @@ def test_a_command_line_gives_the_worker_what_the_panel_has(stages, name):
 @pytest.mark.parametrize("name", NAMES)
 def test_defaults_are_the_workers(bpy, registered, stages, name):
     """What a panel shows at first is left out of the command line: the worker's default holds."""
-    properties = importlib.import_module("limber_addon.properties")
+    properties = part("properties")
     stage = stages[name]
     values = properties.values_of(properties.group_of(bpy.context.scene, stage), stage)
     needed = {key: f"some-{key}" for key, field in stage.fields.items() if field.is_required}

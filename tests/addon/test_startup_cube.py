@@ -36,31 +36,16 @@ def test_it_makes_way_for_a_scan(bpy, cube, tmp_path, capfd):
     assert "startup cube (Cube) was hidden" in capfd.readouterr().out
 
 
-def _bevel(cube):
-    cube.modifiers.new("Bevel", "BEVEL")
+CHANGES = {
+    "bevel": lambda cube: cube.modifiers.new("Bevel", "BEVEL"),
+    "move": lambda cube: setattr(cube.location, "x", 3.0),
+    "scale": lambda cube: setattr(cube, "scale", (0.1, 0.1, 0.1)),
+    "rename": lambda cube: setattr(cube, "name", "Table"),
+    "shape": lambda cube: setattr(cube.data.vertices[0].co, "z", 0.5),
+    "paint": lambda cube: cube.data.materials.clear()}
 
 
-def _move(cube):
-    cube.location.x = 3.0
-
-
-def _scale(cube):
-    cube.scale = (0.1, 0.1, 0.1)
-
-
-def _rename(cube):
-    cube.name = "Table"
-
-
-def _shape(cube):
-    cube.data.vertices[0].co.z = 0.5
-
-
-def _paint(cube):
-    cube.data.materials.clear()
-
-
-@pytest.mark.parametrize("change", [_bevel, _move, _scale, _rename, _shape, _paint])
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_cube_of_the_users_stays(bpy, cube, tmp_path, change):
     """Whatever it was changed into, it is theirs."""
     change(cube)

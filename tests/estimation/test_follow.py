@@ -11,7 +11,10 @@ import pytest
 from limber.core.progress import Progress
 from limber.estimation.online import follow
 from limber.estimation.online.filter import OnlineState
+from limber.estimation.settings import FitSpec
 from limber.recordings.recording import EXACT, CalibrationEntry, write_pull
+from limber.stages.moduli.estimate import _followed
+from limber.store import Branch
 
 
 @pytest.mark.slow
@@ -73,9 +76,6 @@ def test_it_says_enough_only_where_noise_alone_limits(plain_pull, calibration, t
 
 def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
     """A recorder's lines stand beside the folder's files until it has ended."""
-    from limber.estimation.settings import FitSpec
-    from limber.stages.moduli.estimate import _followed
-
     settings = FitSpec(pull=("live",))
     with bare_branch.stream("pulls/live/pull.toml") as lines:
         lines.append("# growing")
@@ -91,9 +91,6 @@ def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
 def test_a_recording_that_ends_is_followed_to_its_last_frame(bare_branch, tmp_path, plain_pull,
                                                              monkeypatch):
     """Its files move into the branch then; slow preparations may even see nothing else of it."""
-    from limber.estimation.settings import FitSpec
-    from limber.stages.moduli.estimate import _followed
-
     monkeypatch.setattr(follow, "QUIET_SECONDS", 1.5)
     write_pull(tmp_path / "whole", plain_pull)
     names = ("pull.toml", "robot.csv", "markers.csv")
@@ -118,6 +115,4 @@ def test_a_recording_that_ends_is_followed_to_its_last_frame(bare_branch, tmp_pa
 
 @pytest.fixture
 def bare_branch(tmp_path):
-    from limber.store import Branch
-
     return Branch.create(tmp_path / "bare.branch")

@@ -7,16 +7,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import pose_vectors
+from limber.core.progress import Progress
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import write_depth
-from limber.recordings import bag_reader
+from limber.recordings import bag_pull, bag_reader
 from limber.recordings.bag_pull import _Messages, pull_of_bag, write_mcap
 from limber.recordings.bag_reader import Bag, Topic, bag_arrays, read_bag, stamped
 from limber.recordings.import_request import ImportRequest
-from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.recording import CalibrationEntry, read_pull, write_pull
 from limber.recordings.settings import ImportSpec
+from limber.stages.moduli import estimate as stage
 from limber.stages.pulls.export_pull import ExportPull
 from limber.stages.pulls.import_pull import ImportPull
 
@@ -183,9 +187,6 @@ def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):
 def test_joint_angles_need_the_cell(tmp_path, bare_folder):
     """In any order, with a robot's own names; the base's pose in the branch's frame is the
     cell's."""
-    from limber.cell.cell_file import Cell, write_cell
-    from limber.core.numerics.rigid import pose_vectors
-
     names = ["elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
              "wrist_2_joint", "wrist_3_joint"]
     with Written(tmp_path / "joints.mcap") as bag:
@@ -206,9 +207,6 @@ def test_joint_angles_need_the_cell(tmp_path, bare_folder):
 @pytest.mark.slow
 def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, recorded_data):
     """The arm of a URDF file whose first joint has a name of its own."""
-    from limber.cell.cell_file import read_cell
-    from limber.core.numerics.rigid import pose_vectors
-
     text = (recorded_data / "ur5_urdf" / "ur5.urdf").read_text(encoding="utf-8")
     (tmp_path / "own.urdf").write_text(text.replace("shoulder_pan_joint", "waist"),
                                        encoding="utf-8")
@@ -333,8 +331,6 @@ def test_a_robots_log_alone_is_a_pull(tmp_path, bare_folder):
 
 def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
     """One command imports the bag under a name of its own, and estimates from it."""
-    from limber.stages.moduli import estimate as stage
-
     pull = read_pull(branch_folder / "pulls" / "pull-1")
     write_mcap(tmp_path / "run 7.mcap", branch_folder / "pulls" / "pull-1", pull)
     monkeypatch.setattr(stage, "_estimate", lambda _branch, asked, _: {"used": asked.pull})
@@ -350,10 +346,6 @@ def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, bare_folder):
-    from limber.cell.cell_file import Cell, write_cell
-    from limber.core.progress import Progress
-    from limber.recordings.recording import CalibrationEntry
-
     with Written(tmp_path / "theirs.mcap") as bag:
         pulled(bag)
     said: list[str] = []
@@ -379,9 +371,6 @@ def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, ba
 @pytest.mark.slow
 def test_a_broken_description_in_a_bag_costs_only_itself(mcap, tmp_path, bare_folder, plain_pull,
                                                          monkeypatch):
-    from limber.core.progress import Progress
-    from limber.recordings import bag_pull
-
     monkeypatch.setattr(bag_pull, "entry_text", lambda entry: "grasp = {radius_m = -1}")
     write_mcap(tmp_path / "odd.mcap", tmp_path / "spring", plain_pull)
     said: list[str] = []

@@ -1,21 +1,29 @@
 """What a scene shows, worked out by the core: the order of vertices, averages, scales, refusals."""
 
 import ast
+import io
 import json
+import os
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from limber.cell.known_arms import arm_named
 from limber.core.alignment import Alignment
 from limber.core.constants import PATH_COLOURS
 from limber.core.errors import BranchFolderError, InputError
+from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.io.skeletons import write_cylinders
+from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
 from limber.geometry.tets.tree_sweep import straight_beam
 from limber.results.motion_files import node_average
 from limber.results.report import plan_figures
 from limber.results.scene.animation import FIRST, SECOND, scene_data
-from limber.results.scene.colours import linear_of
+from limber.results.scene.colours import balls, linear_of, rods
+from limber.stages.results.scene import MakeScene
 from limber.store import Branch
 
 
@@ -233,8 +241,6 @@ def test_a_simulation_has_its_own_times_and_moves_its_marks(tmp_path, mesh):
     mesh = mesh.with_data(point_data={"control_point": marks})
     frames = _bending(surface, 4)
     fields = np.arange(4.0)[:, None] * np.ones(len(surface))
-    import io
-
     npz = io.BytesIO()
     np.savez(npz, strain_energy_density_j_m3=fields, principal_strain=0.01 * fields,
              det_f=1 - 0.01 * fields, principal_stress_pa=fields[:2])
@@ -264,8 +270,6 @@ def test_stress_over_strength(tmp_path, mesh):
     surface = mesh.nodes[np.unique(mesh.surface_faces())]
     mesh = mesh.with_data(cell_data={"young": np.full(mesh.tet_count, 5e9)})
     stress = np.linspace(0, 45e6, 3)[:, None] * np.ones(len(surface))
-    import io
-
     npz = io.BytesIO()
     np.savez(npz, principal_stress_pa=stress)
     branch = _branch(tmp_path / "a.branch", mesh, simulate={
@@ -285,8 +289,6 @@ def test_stress_over_strength(tmp_path, mesh):
 
 def test_rods_lie_about_their_lines(mesh):
     """Each vertex at the radius of its point, across the line; lines without length have none."""
-    from limber.results.scene.colours import rods
-
     points = np.array([[0, 0, 0], [0, 0, 1.0], [1.0, 0, 1.0]])
     vertices, faces, node = rods(points, np.array([[0, 1], [1, 2], [1, 1]]),
                                  np.array([0.1, 0.1, 0.2]))
@@ -298,8 +300,6 @@ def test_rods_lie_about_their_lines(mesh):
 
 def test_balls_lie_about_their_points():
     """Twelve vertices a point, all at the radius; their triangles look outwards."""
-    from limber.results.scene.colours import balls
-
     points = np.array([[0, 0, 0], [5.0, 0, 1.0]])
     vertices, faces, node = balls(points, 0.1)
     assert len(vertices) == 24 and len(faces) == 40
@@ -350,8 +350,6 @@ def test_graphs_of_an_estimate(tmp_path, mesh):
 
 def test_the_newest_motion_is_the_one_finished_last(tmp_path, mesh):
     """By the manifest, not by the files' own times, which a copy changes."""
-    import os
-
     surface = mesh.nodes[np.unique(mesh.surface_faces())]
     branch = _branch(tmp_path / "a.branch", mesh,
                      simulate={"frames/b.pc2": _pc2(_bending(surface, 3))},
@@ -379,10 +377,6 @@ def test_motions_are_named(tmp_path, mesh):
 
 def test_scan_skeleton_and_path_energy(tmp_path, mesh):
     """The cloud with linear colours, the centreline with radii and flags, energy along paths."""
-    from limber.geometry.cloud.cloud import Cloud
-    from limber.geometry.io.skeletons import write_cylinders
-    from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
-
     nodes = np.array([[0, 0, 0], [0, 0, 0.2], [0, 0, 0.5], [0.1, 0, 0.3]], float)
     skeleton = Skeleton.from_edges(nodes, np.array([-1, 0, 1, 1]), np.array([.01, .01, .005, .004]),
                                    radius_sigma=np.array([0, 1e-4, 2e-4, 3e-4]),
@@ -432,8 +426,6 @@ def test_the_map_offset_is_kept_in_double_precision(tmp_path, mesh):
 
 def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
     """What `limber target` wrote is in the file that the add-on opens."""
-    from limber.stages.results.scene import MakeScene
-
     targets = {"format_version": 1, "targets": [
         {"name": "flower", "position_m": [0.0, 0.0, 0.4], "mass_kg": 0.01}]}
     _branch(tmp_path / "a.branch", mesh.with_data(
@@ -448,8 +440,6 @@ def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
 
 def _preview(joints, base, arm):
     """A dry run's table for these joints; its poses are those of the flange."""
-    from limber.core.numerics.rigid import matrices, pose_vectors
-
     poses = pose_vectors(matrices(np.array(base)) @ arm.forward(joints))
     columns = ["t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
                *(f"q{n}_rad" for n in range(1, 7)), "fx_n", "fy_n", "fz_n"]
@@ -462,9 +452,6 @@ def _preview(joints, base, arm):
 def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, model):
     """In each frame: foot and links as rods of the arm's own lengths, and the cell's gripper,
     which is in the picture; an arm that is elsewhere, or not known here, is not shown."""
-    from limber.cell.known_arms import arm_named
-    from limber.core.numerics.rigid import matrices
-
     arm = arm_named("ur5e")
     steps = np.linspace(0, 1, 41)[:, None]
     joints = np.array([0.4, -1.2, 1.5, -0.3, 0.8, 0.2]) + steps * [0.3, 0.1, -0.2, 0.2, 0.1, 0.0]
