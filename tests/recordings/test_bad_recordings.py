@@ -302,6 +302,7 @@ def test_a_pull_without_force_is_named(plain_pull):
 @pytest.mark.parametrize(("change", "told"), [
     (lambda p: 1e3 * p, "millimetres"), (lambda p: p[:, [2, 1, 0]], "likely z, y, x"),
     (lambda p: p[:, [1, 2, 0]], "likely y, z, x"), (lambda p: p - [0.5, 0, 0.2], "of the scan"),
+    (lambda p: (p + [-0.5, 0, -0.2])[:, [1, 2, 0]] - [-0.5, 0, -0.2], "likely y, z, x"),
     (lambda p: p + 3.0, "")])
 def test_the_slip_that_puts_points_on_the_branch(change, told):
     """Millimetres, exchanged titles, the scan's frame; none where none fits."""

@@ -239,6 +239,13 @@ def test_three_columns_are_a_pull(branch_folder, table, capsys):
     assert line["load_n"] == pytest.approx([1.2, 0, 0])
 
 
+def test_a_force_along_the_branch_is_refused(branch_folder, table, capsys):
+    """A standing branch that is pushed down, as the default is, would only be squeezed."""
+    assert imported(branch_folder, table, "--direction", "0", "0", "-1") == 2
+    assert "stretches or squeezes" in capsys.readouterr().out
+    assert not (branch_folder / "pulls" / "gauge").exists()
+
+
 @pytest.mark.slow
 def test_a_gauge_and_a_ruler_give_the_modulus(branch_folder, table):
     """Of one slope only the common scale is known: the moduli between are assumed to vary."""

@@ -82,10 +82,10 @@ def test_robot_tables_of_ur_and_with_quaternions(tmp_path):
     """RTDE's names, and a quaternion instead of a rotation vector; forces in gram-force."""
     ur = "timestamp " + " ".join(f"actual_TCP_pose_{k}" for k in range(6)) + " " + " ".join(
         f"actual_TCP_force_{k}" for k in range(6))
-    rows = "\n".join(" ".join(map(str, [k, *range(12)])) for k in range(3))
+    rows = "\n".join(" ".join(map(str, [k, *np.arange(12) / 4])) for k in range(3))
     stream = robot_stream(written(tmp_path, f"{ur}\n{rows}\n"))
     assert stream.columns[3] == "rx_rad" and stream.columns[-1] == "tz_nm"
-    assert np.allclose(stream.values[0], range(12))
+    assert np.allclose(stream.values[0], np.arange(12) / 4)
     half = np.sqrt(0.5)
     path = written(tmp_path, "t_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw,Fx (gf),Fy (gf),Fz (gf)\n"
                    f"0,1,2,3,0,0,{half},{half},100,0,0\n500,1,2,3,0,0,{half},{half},100,0,0\n")

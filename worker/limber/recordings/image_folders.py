@@ -44,10 +44,6 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
     """Import PLY files into ``clouds/``, in metres and named by their time stamps; return warnings.
     InputError for fewer than two files, or names without times and no rate."""
     files = sorted(source.glob("*.ply"))
-    if len(files) < 2:
-        raise InputError(f"{source} has {len(files)} PLY files.",
-                         "A folder of frames was expected.", "Give the folder that contains the "
-                                                             "frames.")
     broken = []
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     for index, file in enumerate(files):
@@ -61,8 +57,9 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
         write_frame(folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply",
                     read.points * UNIT_METRES[unit_of(read, settings.unit)[0]])
     if len(files) - len(broken) < 2:
-        raise InputError(f"{source}: {len(broken)} of {len(files)} PLY files cannot be read.",
-                         "At least two frames are needed.", "Record it again.")
+        raise InputError(f"{source} has {len(files)} PLY files, of which {len(broken)} cannot be "
+                         "read.", "At least two frames are needed.",
+                         "Give the folder that contains the frames, or record them again.")
     if (source / "camera.toml").exists():
         write_camera(folder / "camera.toml", read_camera(source / "camera.toml"))
     return [f"{len(broken)} PLY file(s) cannot be read and were discarded. The first is "

@@ -60,7 +60,12 @@ from limber.recordings.recording_formats import (
     recording_format,
 )
 from limber.recordings.sensor_checks import clean, force_unit_suspicion
-from limber.recordings.slips import require_bent_as_pulled, require_followed, require_no_slip
+from limber.recordings.slips import (
+    Cantilever,
+    require_bent_as_pulled,
+    require_followed,
+    require_no_slip,
+)
 from limber.recordings.synchronisation import DETERMINED_S, estimate_offset
 from limber.recordings.tables import (
     LENGTH_UNITS_M,
@@ -74,6 +79,9 @@ from limber.recordings.tables import (
 )
 from limber.recordings.time_series import MAD_TO_SIGMA, Stream
 
+_LEAST_BENDING_ANGLE = 20.0
+"""Angle [degrees] between a gauge and the branch below which its direction is refused: there an
+error of 5 degrees changes the modulus by half."""
 UNLOADED = 0.01
 """Fraction of the largest force of a table below which the branch is unloaded."""
 _GRASP = {"grasp_point", "grasp_distance"}
@@ -472,6 +480,7 @@ def _gauge(table: ForceTable, request: ImportRequest) -> tuple[Pull, dict[str, A
     if settings.coordinates == "scan":
         direction = np.array(request.branch.alignment.rotation) @ direction
     point = np.array(request.grasp_or(lambda: np.zeros(3)))
+    _require_bending(request, point, direction)
     entry = request.entry("markers", point[None], tuple(point.tolist()), drive="force",
                           grasp_mode="point")
     entry = request.as_stated(
@@ -486,6 +495,22 @@ def _gauge(table: ForceTable, request: ImportRequest) -> tuple[Pull, dict[str, A
     return _pull(request, entry, robot, Observations(times, seen[:, None])), {
         "load_n": (peak * direction).tolist(),
         "displacement_m": (seen[[np.argmax(np.abs(table.force))]] - point).tolist()}
+
+
+def _require_bending(request: ImportRequest, point: np.ndarray, direction: np.ndarray) -> None:
+    """Refuse the direction of a force at a point [m], [3] each, that runs along the branch."""
+    skeleton = request.branch.skeleton
+    beam = None if skeleton is None else Cantilever.of(skeleton, point)
+    if beam is None:
+        return
+    angle = float(np.degrees(np.arccos(min(1.0, abs(beam.stiffest_axis() @ direction)))))
+    if angle < _LEAST_BENDING_ANGLE:
+        raise InputError(
+            Text(f"{request.name}: the force acts at {angle:.0f} degrees to the branch, from its "
+                 "base to where it is held."), "Such a force stretches or squeezes the branch. A "
+            "test of its stiffness bends it.", "State the direction in which it was pulled and "
+            "measured: ", Option("direction"), " X Y Z, in the frame set by ",
+            Option("coordinates"), ".")
 
 
 def _slope_alone(read: ForceTable, request: ImportRequest) -> dict[str, Any]:

@@ -37,6 +37,8 @@ _FOLLOWS = 0.5
 """Fraction of its misfit that points have left with another offset of the clocks that is named."""
 _NOISES = 5.0
 """Noises of the force that its change must exceed to have a direction."""
+_LEAST_PIECES = 24
+"""Pieces of the beam."""
 AS_POSES = "poses"
 _DEGREES = (10.0, 150.0)
 """Ratios of recorded to expected rotations that show degrees: 57, and the beam's error."""
@@ -58,11 +60,6 @@ def require_no_slip(pull: Pull) -> Pull:
         raise InputError(f"{name}: the times of the gripper span {length:.4g} s.",
                          "No pull lasts longer than an hour. They are likely milliseconds or "
                          "microseconds.", "Name the unit in the title of the column: t_ms, t_us.")
-    turn = float(np.nanmax(np.linalg.norm(poses[:, 3:], axis=1), initial=0.0))
-    if turn > 2 * np.pi:
-        raise InputError(f"{name}: the gripper's rotation vector has a length of {turn:.4g} rad.",
-                         "A rotation has at most 6.28 rad. The columns are likely in degrees.",
-                         "Name the unit in their titles: rx_deg, ry_deg, rz_deg.")
     speed = float(np.nanmax(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) / np.diff(times),
                             initial=0.0))
     if speed > _FASTEST_M_S:
@@ -100,7 +97,9 @@ def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, nea
         # Nearer points would all fit at the root.
         if np.abs(points).max() > 5 * np.abs(nodes).max() and off(factor * points) <= near:
             return f"They fit as {unit}: name the unit in the titles, such as x_{unit[0]}m."
-    away = {name: off(points @ turn.T) for name, turn in AXES.items() if name != "x,y,z"}
+    recorded = alignment.undo(points) * alignment.scale
+    away = {name: min(off(points @ turn.T), off(alignment.apply_metres(recorded @ turn.T)))
+            for name, turn in AXES.items() if name != "x,y,z"}
     name = min(away, key=lambda each: away[each])
     if off(alignment.apply_metres(points)) <= min(near, away[name]):
         return Text("They fit in the frame of the scan: state ", Option("coordinates", "scan"), ".")
@@ -147,16 +146,26 @@ class Cantilever:
         while skeleton.parent[path[-1]] >= 0:
             path.append(int(skeleton.parent[path[-1]]))
         path = path[::-1]
-        nodes = np.vstack([skeleton.nodes[path[:-1]], grasp])
+        last = len(path) - 1
+        known = np.c_[np.vstack([skeleton.nodes[path[:-1]], grasp]), skeleton.radius[path]]
+        # An axis of few points is cut finer, as the moment changes along it.
+        at = np.linspace(0, last, last * -(-_LEAST_PIECES // max(last, 1)) + 1)
+        fine = np.column_stack([np.interp(at, np.arange(last + 1), values) for values in known.T])
+        nodes, radius = fine[:, :3], fine[:, 3]
         steps = np.diff(nodes, axis=0)
         sizes = np.linalg.norm(steps, axis=1)
-        if len(nodes) < 4 or not sizes.all():
+        if not len(sizes) or not sizes.all():
             return None
         along = steps / sizes[:, None]
-        second = np.pi / 4 * np.convolve(skeleton.radius[path], [0.5, 0.5], "valid")**4
+        second = np.pi / 4 * np.convolve(radius, [0.5, 0.5], "valid")**4
         # Twist: 1 / (G J) with J = 2 I and Poisson's ratio 0.35.
         sides = np.eye(3) + 0.35 * np.einsum("ni,nj->nij", along, along)
         return cls(grasp, (nodes[1:] + nodes[:-1]) / 2, sides * (sizes / second)[:, None, None])
+
+    def stiffest_axis(self) -> np.ndarray:
+        """Return the direction in which a force at the grasp bends the beam least, [3]."""
+        levers = (self.grasp - self.middles)[None]
+        return _across(self.responses(levers, levers)[0][0])[1][:, 0]
 
     def bent(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return rotations and displacements of the middles, [n, N, 3] each, for the grasp at

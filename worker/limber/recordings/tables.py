@@ -693,6 +693,12 @@ def _scale(name: str, title: Title, force_unit: str | None, path: Path) -> float
 def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: Stream,
                   warnings: list[str], path: Path) -> None:
     if all(name in values for name in POSE_COLUMNS[3:]):
+        vectors = np.column_stack([values[name] for name in POSE_COLUMNS[3:]])
+        longest = float(np.nanmax(np.linalg.norm(vectors, axis=1), initial=0.0))
+        if longest > 2 * np.pi:
+            raise InputError(f"{path.name}: the gripper's rotation vector is {longest:.3g} rad.",
+                             "A rotation has at most 6.28 rad. These are likely degrees.",
+                             "Name the unit in the titles: rx_deg, ry_deg, rz_deg.")
         return
     at = {title.plain: k for k, title in enumerate(titles)}
     angles = next((names for names in _ANGLES if set(names) <= set(at)), None)

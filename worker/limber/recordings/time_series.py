@@ -93,9 +93,9 @@ def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> 
     expected = np.median(windows - slope[..., None] * offset, axis=2)
     residual = np.abs(values - expected)
     # One scale for all axes: a sensor's noise is similar in all of them, and an axis that hardly
-    # moves does not show it.
-    typical = MAD_TO_SIGMA * np.median(residual[np.any(residual > 0, axis=1)]
-                                       if np.any(residual) else residual)
+    # moves does not show it, less one that is not measured.
+    varied = residual[np.ix_(residual.any(axis=1), residual.any(axis=0))]
+    typical = MAD_TO_SIGMA * np.median(varied) if varied.size else 0.0
     far = residual > threshold * typical + 1e-3 * np.abs(values).max()
     # A spike distorts the line of its neighbours, whose deviations then look large too, but
     # smaller.
