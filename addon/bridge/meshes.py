@@ -138,6 +138,7 @@ def give(mesh: bpy.types.Mesh, new: bpy.types.Mesh, *, is_edited_kept: bool = Fa
         is_edited_kept: Whether vertices that the user has removed or added are kept too.
     """
     before, now = mesh[GIVEN_KEY].to_dict(), _digests(new)
+    active = mesh.color_attributes.active_color_name
     if is_edited_kept and before == now:
         return
     if before[_FACES] != now[_FACES] or not has_same_faces(mesh, new):
@@ -151,11 +152,14 @@ def give(mesh: bpy.types.Mesh, new: bpy.types.Mesh, *, is_edited_kept: bool = Fa
                 set_values(mesh, name, values_of(new, name), new.attributes[name].data_type)
         mesh.update()
     mesh[GIVEN_KEY] = now
+    colours = [name for name in (active, new.color_attributes.active_color_name)
+               if name in mesh.color_attributes]
+    if colours:
+        mesh.color_attributes.active_color_name = colours[0]
 
 
 def replace(mesh: bpy.types.Mesh, new: bpy.types.Mesh) -> None:
     """Replace vertices, faces and attributes of a mesh by those of another."""
-    active = mesh.color_attributes.active_color_name
     builder = bmesh.new()
     try:
         builder.from_mesh(new)
@@ -166,10 +170,6 @@ def replace(mesh: bpy.types.Mesh, new: bpy.types.Mesh) -> None:
         # Blender writes an array into a longer one that is there, whose end stays.
         mesh.pop(key, None)
         mesh[key] = new[key]
-    colours = [name for name in (active, new.color_attributes.active_color_name)
-               if name in mesh.color_attributes]
-    if colours:
-        mesh.color_attributes.active_color_name = colours[0]
     mesh.update()
 
 

@@ -227,10 +227,10 @@ def _scene_settings(bpy):
                     scene.unit_settings.system, scene.cursor.location[:])
 
 
-def _range_of_ours(bpy):
+def _as_opened(bpy):
     # Set by the first showing: no later one changes it.
-    scene = bpy.context.scene
-    return lambda: (scene.frame_start, scene.frame_end)
+    return lambda: (bpy.context.scene.frame_start, bpy.context.scene.frame_end,
+                    things(bpy)["beam"].data.color_attributes.active_color_name)
 
 
 def _timing(bpy):
@@ -288,7 +288,7 @@ def _edit_mode(bpy):
 THINGS = (_own_object, _own_object_with_keys, _moved, _renamed, _keyed, _coloured, _coloured_by,
           _coloured_by_an_attribute, _modifiers, _constraints_and_parents, _nested, _second_scene,
           _instanced, _properties, _visible, _mesh_layers, _own_mesh, _scene_settings,
-          _range_of_ours, _timing, _selection, _copied, _linked, _edit_mode)
+          _as_opened, _timing, _selection, _copied, _linked, _edit_mode)
 
 
 @pytest.fixture(scope="module")
