@@ -44,7 +44,6 @@ class SteppedRos(SteppedRobot):
                 self.plan(self.since)
         if self.bridge is not None:
             self.server.turn(self.bridge, self._count, self._told)
-            self.bridge.send_held()
         if self._watch is not None:
             self._look_after_it()
 
@@ -80,7 +79,7 @@ class SteppedBridge(Bridge):
     stands for :class:`limber.robot.ros.bridge.Bridge`."""
 
     def __init__(self, robot):
-        self._robot, self.texts, self._held, self.is_lost = robot, deque(), [], False
+        self._robot, self.texts, self.is_lost = robot, deque(), False
 
     def send(self, order=None, **content):
         """Carry out an operation; of the server: take what it sends."""
@@ -88,17 +87,9 @@ class SteppedBridge(Bridge):
             self.texts.append(order)
             return
         self._require_connection()
-        if self._robot.server.blocks and self._robot.server.is_busy:
-            self._held.append(content)
-            return
         self._robot.server.obey(self, content)
         if content["op"] == "send_action_goal":
             self._robot.since = 0
-
-    def send_held(self):
-        """Carry out what waited for the end of a goal."""
-        while self._held and not self._robot.server.is_busy:
-            self._robot.server.obey(self, self._held.pop(0))
 
     def receive(self, seconds):
         """Return the next message, if any; before, where none waits, time passes."""

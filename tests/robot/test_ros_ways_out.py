@@ -17,12 +17,6 @@ from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory
 from limber.robot.ros.topics import Topics, wrench_topic
 
-
-@pytest.fixture(autouse=True)
-def own_state(monkeypatch, tmp_path):
-    monkeypatch.setenv("LIMBER_STATE", str(tmp_path / "state"))
-
-
 _MOST_M = 0.02  # of way until it stands: at 30 mm/s 0.6 s, the node beside the controller takes 0.3
 SAFETY, MODE, PROGRAM, SCALING = RosBridge(HOME).status
 
@@ -88,15 +82,22 @@ FAULTS = {
     "goal called reached early": ("calls its goal reached", _ended(4, error_code=0)),
     "rosbridge without actions": ("update rosbridge_suite", lambda robot, link: robot.bridge.send(
         json.dumps({"op": "status", "level": "error", "msg": "Unknown operation"}))),
-    "arm stands under its goal": ("stood still for 2", _set(sticks=True)),
+    "arm stands under its goal": ("stood still for 2|its path", _set(sticks=True)),
     "clock jumps ahead": ("clock jumped", _set(clock_ahead=7.0)),
     "clock jumps back": ("clock ran backwards", _set(clock_ahead=-1.0)),
-    "stop of another node": ("a stop was published", lambda robot, link: robot.server.obey(
+    "stop of another node": ("[aA] stop was published", lambda robot, link: robot.server.obey(
         None, {"op": "publish", "topic": "/limber/stop", "msg": {"data": True}})),
     "push of 30 N": ("force", _set(wrench=np.array([0, 0, 30.0, 0, 0, 0])))}
 """Each with what the report must contain, as a regular expression; "": it is no fault, and the goal
 is reached."""
 _FOR_THE_NODE = ("kill -9", "connection to rosbridge lost")  # Limber can give no more orders
+
+_OF_GOALS = ("stop topic not passed on", "goal aborted", "goal cancelled by another", "goal missed",
+             "goal called reached early", "rosbridge without actions", "slider at a fifth")
+
+
+def with_names(**names: str) -> Cell:
+    return CELL.model_copy(update={"robot": CELL.robot.model_copy(update={"ros": names})})
 
 
 def there_and_back(out: Trajectory, rest: float) -> Trajectory:
@@ -105,12 +106,32 @@ def there_and_back(out: Trajectory, rest: float) -> Trajectory:
                       ExpectedWrench.nothing(poses), joints)
 
 
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_stopped_and_named_and_nothing_moves_after_its_release(name):
+class ServoBridge(RosBridge):
+    """MoveIt Servo's end: it moves the joints by the last speeds that came, for 0.1 s."""
+
+    until = 0
+
+    def _hear(self, socket, order):
+        super()._hear(socket, order)
+        if order["op"] == "publish" and order["topic"] == Topics().jog:
+            speeds = dict(zip(order["msg"]["joint_names"], order["msg"]["velocities"], strict=True))
+            self.drift = np.array([speeds[f"{name}_joint"] for name in CELL.arm.ros_joints])
+            self.until = 0.1 / STEP
+
+    def _step(self, socket):
+        self.until -= 1
+        self.drift = self.drift * (self.until > 0 and not self.sticks)
+        super()._step(socket)
+
+
+@pytest.mark.parametrize("name, kind, output", [
+    *((name, RosBridge, "trajectory") for name in FAULTS),
+    *((name, ServoBridge, "servo") for name in FAULTS if name not in _OF_GOALS)])
+def test_a_fault_is_stopped_and_named_and_nothing_moves_after_its_release(name, kind, output):
     told, fault = FAULTS[name]
-    robot = SteppedRos(RosBridge(HOME), has_node=not told or name in _FOR_THE_NODE)
+    robot = SteppedRos(kind(HOME), has_node=not told or name in _FOR_THE_NODE)
     server, well = robot.server, dict(robot.server.status)
-    with robot.here(), RobotLink(CELL) as link:
+    with robot.here(), RobotLink(with_names(output=output)) as link:
         link.wait_for_samples()
         link.tare(0.25)
         link.start(there_and_back(line(0.07, 0.03), 0.02))
@@ -131,10 +152,6 @@ def test_a_fault_is_stopped_and_named_and_nothing_moves_after_its_release(name):
     assert not server.is_busy and np.array_equal(server.joints, stood)
     way = CELL.arm.forward(np.array([began, stood]))[:, :3, 3]
     assert not told or np.linalg.norm(way[1] - way[0]) < _MOST_M
-
-
-def with_names(**names: str) -> Cell:
-    return CELL.model_copy(update={"robot": CELL.robot.model_copy(update={"ros": names})})
 
 
 def said(robot: SteppedRos) -> list[str]:
@@ -196,30 +213,20 @@ def test_a_rest_of_the_path_and_a_slow_controller_are_no_standstill(stepped_ros,
     assert event["event"] == "reached", event
 
 
-def test_a_robot_whose_joint_states_are_of_another_node_alone_is_refused(stepped_ros):
-    with pytest.raises(WorkError, match="It has the joints finger_joint, other_finger_joint, not"):
-        stepped_ros(others=GRIPPER, has_arm=False)
-
-
-@pytest.mark.parametrize("topic", [SAFETY, MODE, PROGRAM, SCALING])
-def test_a_ur_arm_is_not_moved_without_what_its_driver_publishes(stepped_ros, topic):
-    with pytest.raises(WorkError, match=f"Nothing came on {topic} within 2 s.*"
-                                        "ur_control.launch.py ur_type:=ur5e"):
-        stepped_ros(silent={topic})
+@pytest.mark.parametrize("settings, told", [
+    ({"others": GRIPPER, "has_arm": False}, "It has the joints finger_joint, other_finger_joint, "),
+    ({"silent": {Topics().wrench}}, f"Too little came on {Topics().wrench}"),
+    *(({"silent": {topic}}, f"Nothing came on {topic} within 2 s.*launch.py ur_type:=ur5e")
+      for topic in (SAFETY, MODE, PROGRAM, SCALING))])
+def test_a_robot_that_says_too_little_is_not_moved(stepped_ros, settings, told):
+    with pytest.raises(WorkError, match=told):
+        stepped_ros(**settings)
 
 
 def test_a_leg_to_its_end_gives_the_node_an_end_word_and_no_stop(stepped_ros):
     robot, link = stepped_ros()
     assert link.follow(line(0.02))["event"] == "reached"
     assert said(robot) == ["beat", "goal", "end"] and link.warnings == []
-
-
-def test_a_bridge_that_a_goal_blocks_is_noticed(stepped_ros):
-    """rosbridge's default: a stop waits there until the goal has ended."""
-    _, link = stepped_ros(blocks=True)
-    event = link.follow(line(0.1, 0.01))
-    assert event["event"] == "stopped"
-    assert "send_action_goals_in_new_thread:=true" in event["reason"]
 
 
 def test_the_noise_of_joint_speeds_is_no_motion(stepped_ros):
@@ -240,9 +247,11 @@ def test_a_name_space_and_a_prefix_choose_one_of_two_arms(stepped_ros):
     assert goal["args"]["trajectory"]["joint_names"][0] == "left_shoulder_pan_joint"
 
 
-def test_a_name_that_is_none_is_refused(stepped_ros):
-    with pytest.raises(InputError, match=r"states joint_state.*Known are namespace, prefix"):
-        stepped_ros(cell=with_names(joint_state="/x"))
+@pytest.mark.parametrize("name, told", [
+    ("joint_state", "states joint_state.*Known are namespace, prefix"), ("output", "output is /x")])
+def test_a_name_that_is_none_is_refused(stepped_ros, name, told):
+    with pytest.raises(InputError, match=told):
+        stepped_ros(cell=with_names(**{name: "/x"}))
 
 
 def test_the_gripper_moves_by_its_action(stepped_ros):

@@ -45,8 +45,6 @@ class RosBridge:
         speed_noise: Of joint states [rad/s].
         prefix: Of the names of its joints.
         space: Name space of all but the joint states.
-        blocks: A running goal blocks what a stepped client sends after it, as rosbridge does by
-            default.
     """
 
     def __init__(self, joints):
@@ -59,7 +57,7 @@ class RosBridge:
                        "/io_and_status_controller/robot_mode": {"mode": 7},
                        _PROGRAM: {"data": True}, _SCALING: {"data": 100.0}}
         self.others, self.has_arm, self.sticks = [], True, False
-        self.accepts_after, self.blocks = 0, False
+        self.accepts_after = 0
         self.speed_noise, self.prefix, self.space = 0.0, "", ""
         self.gripped, self.payload, self.clock_ahead = lambda position: None, 0.0, 0.0
         self._subscribed, self._offering = {}, None

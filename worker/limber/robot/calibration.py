@@ -87,12 +87,11 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
             "Touch points beside it, such as twigs and the rim of the pot.")
     needed = least_depth(largest_residual)
     if spread[2] < needed:
-        raise InputError(
-            f"The points {which} lie in a plane: they spread by {1000 * spread[2]:.1f} mm out of "
-            f"it (root mean square), and {1000 * needed:.0f} mm are needed.",
-            "A mirrored frame would fit equally well.",
-            "Touch points above and below it, such as the rim of the pot and the tip of the "
-            "branch.")
+        raise InputError(f"The points {which} lie in a plane: they spread by "
+                         f"{1000 * spread[2]:.1f} mm out of it (root mean square), and "
+                         f"{1000 * needed:.0f} mm are needed.", "A mirrored frame would fit "
+                         "equally well.", "Touch points above and below it, such as the rim of the "
+                         "pot and the tip of the branch.")
 
 
 def gripper_pose(cell: Cell, sample: Sample) -> np.ndarray:
@@ -106,12 +105,11 @@ def gripper_pose(cell: Cell, sample: Sample) -> np.ndarray:
     for tool in (grasp, np.zeros(6)):
         if is_tool(cell, sample, tool):
             return _carried(sample.pose, tool, grasp)
-    raise InputError(
-        "The tool centre point in the controller is at about "
-        f"{in_millimetres(tool_in_controller(cell, sample))} in the "
-        f"flange's frame, but the cell's tool.grasp_pose is at {in_millimetres(grasp)}.",
-        "So the controller's pose is not the pose of the gripper's centre.",
-        "Set the tool centre point to tool.grasp_pose on the pendant, or correct the cell file.")
+    raise InputError("The tool centre point in the controller is at about "
+                     f"{in_millimetres(tool_in_controller(cell, sample))} in the flange's frame, "
+                     f"but the cell's tool.grasp_pose is at {in_millimetres(grasp)}.", "So the "
+                     "controller's pose is not the pose of the gripper's centre.", "Set the tool "
+                     "centre point to tool.grasp_pose on the pendant, or correct the cell file.")
 
 
 def _carried(pose: np.ndarray, tool: np.ndarray, grasp: np.ndarray) -> np.ndarray:
@@ -278,10 +276,9 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
     what = "board" if seen.shape[1] == 6 else "marker"
     fewest = _FEWEST_VIEWS[seen.shape[1]]
     if len(robot) < fewest:
-        raise InputError(f"Only {len(robot)} views of a {what} are "
-                         "given.", f"At least {fewest} views are needed "
-                         f"to determine camera and {what}, and ten to determine the "
-                         "accuracy.", "Move the arm to more poses.")
+        raise InputError(f"Only {len(robot)} views of a {what} are given.", f"At least {fewest} "
+                         f"views are needed to determine camera and {what}, and ten to determine "
+                         "the accuracy.", "Move the arm to more poses.")
     moves = matrices(robot) if camera_on == "stand" else inverted(matrices(robot))
     _require_turns(moves, what)
     if what == "marker":
@@ -307,11 +304,10 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
 def _require_turns(moves: np.ndarray, what: str) -> None:
     spread = spreads(rotation_vector(moves[:, :3, :3] @ moves[0, :3, :3].T))
     if spread[1] < _LEAST_TURN:
-        raise InputError(
-            f"The arm was turned by {np.degrees(spread[1]):.1f} degrees about a second axis.",
-            f"Camera and {what} could be shifted along the first axis without a visible "
-            "difference.",
-            "Tilt the gripper about two axes, by at least 20 degrees in each direction.")
+        raise InputError(f"The arm was turned by {np.degrees(spread[1]):.1f} degrees about a "
+                         "second axis.", f"Camera and {what} could be shifted along the first axis "
+                         "without a visible difference.", "Tilt the gripper about two axes, by at "
+                         "least 20 degrees in each direction.")
 
 
 def _require_depth(positions: np.ndarray, largest_residual: float) -> None:
@@ -319,11 +315,10 @@ def _require_depth(positions: np.ndarray, largest_residual: float) -> None:
     spread = spreads(positions)[2]
     needed = least_depth(largest_residual)
     if spread < needed:
-        raise InputError(
-            f"The marker positions lie in a plane: they spread by {1000 * spread:.1f} mm out of "
-            f"it (root mean square), and {1000 * needed:.0f} mm are needed.",
-            "A mirrored frame would fit equally well.",
-            "Move the marker to poses in front of and behind that plane.")
+        raise InputError(f"The marker positions lie in a plane: they spread by {1000 * spread:.1f} "
+                         f"mm out of it (root mean square), and {1000 * needed:.0f} mm are needed.",
+                         "A mirrored frame would fit equally well.", "Move the marker to poses in "
+                         "front of and behind that plane.")
 
 
 def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray]:

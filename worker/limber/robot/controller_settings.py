@@ -64,10 +64,9 @@ def require_tool(cell: Cell, sample: Sample) -> None:
     if not is_tool(cell, sample, grasp):
         raise SafetyStop("The tool centre point in the controller is "
                          f"{in_millimetres(tool_in_controller(cell, sample))}, that of the cell "
-                         f"file {in_millimetres(grasp)}.",
-                         "Each target would be of another point of the gripper.",
-                         "Something has changed it since the start: end that program, and begin "
-                         "again.")
+                         f"file {in_millimetres(grasp)}.", "Each target would be of another point "
+                         "of the gripper.", "Something has changed it since the start: end that "
+                         "program, and begin again.")
 
 
 def differences(cell: Cell, sample: Sample, calibration: FactoryCalibration | None = None,

@@ -198,9 +198,8 @@ def look(cell: Cell, branch: np.ndarray, progress: Progress) -> LiveView | None:
             differences = camera_differences(cell, device.camera)
             seen = LiveView.taken(cell, device, branch)
     except LimberError as error:
-        progress.warn(f"No connected camera was asked ({error.seen.rstrip('.')}): the view is "
-                      "that of [camera] in the cell file, and what else stands in it now is not "
-                      "known.")
+        progress.warn(f"No connected camera was asked ({error.seen.rstrip('.')}): the view is that "
+                      "of [camera] in the cell file, and what else stands in it now is not known.")
         return None
     for each in differences:
         progress.warn(f"{each}. The connected camera's own view is taken.")

@@ -196,9 +196,8 @@ def require_sensor(cell: Cell) -> None:
     """Refuse a cell without a force sensor that the guard can rely on: InputError if it names none,
     or a CB3's own estimate."""
     if cell.sensor.kind == "none":
-        raise InputError("The cell file names no force sensor.",
-                         "The guard does not move a branch that it cannot feel.",
-                         "Set sensor.kind to ft300 or controller.")
+        raise InputError("The cell file names no force sensor.", "The guard does not move a branch "
+                         "that it cannot feel.", "Set sensor.kind to ft300 or controller.")
     if cell.sensor.kind == "controller" and not cell.arm.measures_force:
         raise InputError(f"The cell uses the force of the {cell.arm.name}'s own controller.",
                          "A CB3 estimates it from motor currents, with drifting errors of several "

@@ -137,9 +137,8 @@ class Observed:
                                          ("torque", slice(3, 6), sensor.torque_sigma_nm, "N m")):
             if (worst := float(spread[part].max())) > _NOISE * stated:
                 warnings.append(f"the {name} varies by {worst:.2g} {unit} while the arm stands, "
-                                "the "
-                                f"cell file states {stated:.2g} {unit}: the gripper is touched, or "
-                                "the unit differs")
+                                f"the cell file states {stated:.2g} {unit}: the gripper is "
+                                "touched, or the unit differs")
         for name, part, most, unit in (
                 ("force", slice(0, 3), sensor.force_range_n, "N"),
                 ("torque", slice(3, 6), sensor.torque_range_nm, "N m")):
@@ -177,9 +176,8 @@ def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
     :func:`observe`; SafetyStop if a program runs, or the sensor is implausible."""
     seen = observe(cell, _BEFORE_MOTION_SECONDS)
     if seen.is_busy(cell):
-        raise SafetyStop("A program is running on the controller.",
-                         "Limber's own program would end it, wherever it is.",
-                         "Stop it on the pendant.")
+        raise SafetyStop("A program is running on the controller.", "Limber's own program would "
+                         "end it, wherever it is.", "Stop it on the pendant.")
     if warnings := seen.implausible(cell):
         raise SafetyStop(f"The force sensor cannot be right: {'; '.join(warnings)}.", "The guard "
                          "would not feel the branch.", "Check the sensor and the cell's [sensor] "

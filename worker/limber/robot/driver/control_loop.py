@@ -221,6 +221,8 @@ class Driver:
             except LimberError:
                 self.guard.end()
                 raise
+        if getattr(self._control, "by_joints", False):
+            trajectory = replace(trajectory, by_joints=True)
         self._under_way.begin(trajectory)
         self._command = self._require_sample().pose.copy()
         self._hold_ups.set_off()

@@ -6,7 +6,7 @@ from contextlib import closing
 from limber.cell.cell_file import Cell
 from limber.core.errors import Command, InputError, WorkError
 from limber.robot.interface import ArmControl
-from limber.robot.ros.topics import is_ros
+from limber.robot.ros.topics import Topics, is_ros
 from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
 from limber.robot.ur.rtde import Dashboard
 from limber.robot.ur.ur_control import UrControl
@@ -19,16 +19,15 @@ def _virtual(cell: Cell) -> ArmControl:
     if not cell.robot.address.startswith("127."):
         raise InputError(f"{cell.arm.name} has no driver for the controller at robot.address "
                          f"{cell.robot.address}.", "Its URDF file describes the arm, but not the "
-                                                   "controller.",
-                         "Use the virtual robot (127.0.0.x), or register a driver.")
+                         "controller.", "Use the virtual robot (127.0.0.x), or register a driver.")
     return UrControl(cell)
 
 
 def _ros(cell: Cell) -> ArmControl:
     """Open the robot behind a rosbridge."""
-    from limber.robot.ros.ros_control import RosControl
+    from limber.robot.ros.ros_control import RosControl, RosServo
 
-    return RosControl(cell)
+    return (RosServo if Topics.of_cell(cell).output == "servo" else RosControl)(cell)
 
 
 _CONTROLS: dict[str, Callable[[Cell], ArmControl]] = {

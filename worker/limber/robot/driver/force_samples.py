@@ -371,9 +371,8 @@ class WrenchChain:
         if too few, or the gripper was touched: their spread exceeds the noise."""
         readings, self._taring = np.array(self._taring or []), None
         if len(readings) < least:
-            raise WorkError(f"Only {len(readings)} readings arrived for the "
-                            "tare.", f"{least} are needed.",
-                            "Check the sensor's connection.")
+            raise WorkError(f"Only {len(readings)} readings arrived for the tare.", f"{least} are "
+                            "needed.", "Check the sensor's connection.")
         spread = readings.std(axis=0)
         allowed = np.r_[np.full(3, 6 * self.cell.sensor.force_sigma_n + 0.3),
                         np.full(3, 6 * self.cell.sensor.torque_sigma_nm + 0.05)]
@@ -609,9 +608,8 @@ class Senses:
     def begin_tare(self, sample: Sample, seconds: float) -> None:
         """Tare the force over the next ``seconds`` [s]; SafetyStop if the robot moves."""
         if self._under_way.following is not None:
-            raise SafetyStop("The sensor cannot be tared while the robot "
-                             "moves.", "", "Wait until the robot is at "
-                                                                  "rest.")
+            raise SafetyStop("The sensor cannot be tared while the robot moves.", "", "Wait until "
+                             "the robot is at rest.")
         self._chain.start_tare()
         self._tare_until = sample.clock + seconds
 

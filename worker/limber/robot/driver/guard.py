@@ -245,9 +245,8 @@ class Guard:
         """Allow a motion; of one ``by_joints`` singularities are no limit. SafetyStop after a stop
         that was not acknowledged, while one is paused, or before a tare."""
         if self.state != State.IDLE:
-            raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.",
-                             "No motion begins before a person has checked.",
-                             "Choose hold, retreat or release.")
+            raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.", "No motion begins "
+                             "before a person has checked.", "Choose hold, retreat or release.")
         if not self._is_tared:
             raise SafetyStop("The force sensor is not tared.", "Its bias would be taken for a "
                              "force on the branch.", "Tare it with the gripper hanging free.")

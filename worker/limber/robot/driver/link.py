@@ -175,12 +175,11 @@ class RobotLink:
         except subprocess.TimeoutExpired:
             code = None
         if ended_by_deadline(code):
-            return SafetyStop(
-                "The robot was stopped: the controller did not answer its driver for "
-                f"{CALL_SECONDS:g} s, so the driver was ended.", "Its connection works in one "
-                "direction only, or not at "
-                "all.", "Check the robot, which its own watchdog has stopped. "
-                "Check cable and network before connecting again.")
+            return SafetyStop("The robot was stopped: the controller did not answer its driver "
+                              f"for {CALL_SECONDS:g} s, so the driver was ended.", "Its connection "
+                              "works in one direction only, or not at all.", "Check the robot, "
+                              "which its own watchdog has stopped. Check cable and network before "
+                              "connecting again.")
         return WorkError("The robot's driver has ended.", "Its connection broke.",
                          "Check the robot; its own watchdog has stopped it.")
 

@@ -49,9 +49,8 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
     turn = length(turn_between(start, pose))
     if turn > ROTATION_RAD:
         problems.append(f"the gripper is turned by {np.degrees(turn):.1f} degrees against the "
-                        "path's "
-                        f"start: its rotation vector is {in_degrees(pose[3:])} degrees instead of "
-                        f"{in_degrees(start[3:])}")
+                        f"path's start: its rotation vector is {in_degrees(pose[3:])} degrees "
+                        f"instead of {in_degrees(start[3:])}")
     problems += [] if start_joints is None else different_joints(joints, start_joints, names)
     if problems:
         raise SafetyStop(
@@ -279,8 +278,7 @@ class RetreatPath:
         configuration."""
         if not self._poses:
             raise SafetyStop("There is no path to return along.", "The robot has not followed any "
-                                                                  "path yet.",
-                             "")
+                             "path yet.", "")
         poses = np.array(self._poses)
         off = np.linalg.norm(poses[:, :3] - sample.pose[:3], axis=1) / POSITION_M
         # Rotations of the near poses only: a long path has many, and the watchdog waits.
@@ -292,8 +290,7 @@ class RetreatPath:
             away = length(sample.pose[:3] - poses[nearest, :3])
             turn = np.degrees(length(turn_between(poses[nearest], sample.pose)))
             raise SafetyStop(f"The arm is {1000 * away:.1f} mm and {turn:.1f} degrees away from "
-                             "its path.", "Something has moved it.",
-                             "Free the branch by hand.")
+                             "its path.", "Something has moved it.", "Free the branch by hand.")
         if difference := different_joints(sample.joints, self._joints[nearest], self._names):
             raise SafetyStop("The arm is not in the configuration in which it arrived: "
                              f"{'; '.join(difference)}.",

@@ -40,14 +40,13 @@ def contact_speed(cell: Cell) -> float:
     lost = _BRAKING_M_S2 * reaction_seconds(cell)
     speed = float(np.sqrt(lost**2 + 2 * _BRAKING_M_S2 * distance) - lost)
     if speed < _SLOWEST_M_S:
-        raise InputError(
-            f"A contact of {limits.contact_n_per_m:g} N/m (limits.contact_n_per_m) adds more than "
-            f"the force between limits.soft_force_n ({limits.soft_force_n:g} N) and "
-            f"limits.hard_force_n ({limits.hard_force_n:g} N) even at "
-            f"{1e3 * _SLOWEST_M_S:g} mm/s.",
-            f"The arm needs {1e3 * reaction_seconds(cell):.0f} ms to brake.",
-            "Lower limits.soft_force_n, or state in limits.contact_n_per_m how stiff the stiffest "
-            "thing is that the gripper can run into.")
+        raise InputError(f"A contact of {limits.contact_n_per_m:g} N/m (limits.contact_n_per_m) "
+                         "adds more than the force between limits.soft_force_n "
+                         f"({limits.soft_force_n:g} N) and limits.hard_force_n "
+                         f"({limits.hard_force_n:g} N) even at {1e3 * _SLOWEST_M_S:g} mm/s.",
+                         f"The arm needs {1e3 * reaction_seconds(cell):.0f} ms to brake.", "Lower "
+                         "limits.soft_force_n, or state in limits.contact_n_per_m how stiff the "
+                         "stiffest thing is that the gripper can run into.")
     return speed
 
 
@@ -205,9 +204,8 @@ class Trajectory:
                   and self.poses.shape == (len(self.times), 6))
         if not shaped or not np.isfinite(self.poses).all() or np.any(np.diff(self.times) <= 0):
             raise InputError(f"The trajectory has times of shape {self.times.shape} and poses of "
-                             f"shape {self.poses.shape}.",
-                             "It needs increasing times, each with one finite pose.",
-                             "Check the path.")
+                             f"shape {self.poses.shape}.", "It needs increasing times, each with "
+                             "one finite pose.", "Check the path.")
         if self.expected is not None and (
                 self.expected.wrenches.shape != self.poses.shape
                 or not all(np.isfinite(part).all() for part in (
@@ -220,9 +218,8 @@ class Trajectory:
         if self.joints is not None and (self.joints.shape[:-1] != self.times.shape
                                         or not np.isfinite(self.joints).all()):
             raise InputError(f"The joint angles have shape {self.joints.shape} for "
-                             f"{len(self.poses)} poses, or are not "
-                             "finite.", "Each pose needs one angle per joint.",
-                             "Check the path.")
+                             f"{len(self.poses)} poses, or are not finite.", "Each pose needs one "
+                             "angle per joint.", "Check the path.")
 
     @property
     def duration(self) -> float:

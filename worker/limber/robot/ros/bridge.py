@@ -79,16 +79,6 @@ class Bridge:
         self._around.close()
 
 
-_GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
-_GOAL = "limber-gripper"
-
-
-def send_gripper(bridge: Bridge, action: str, position: float, effort: float = 0.0) -> None:
-    """Send a gripper to a position as :func:`drive`, without waiting."""
-    bridge.send(op="send_action_goal", id=_GOAL, action=action, action_type=_GRIPPER_COMMAND,
-                feedback=False, args={"command": {"position": position, "max_effort": effort}})
-
-
 _CALL = "limber-call"
 
 
@@ -99,14 +89,13 @@ def call(bridge: Bridge, service: str, kind: str, take: Callable[[dict[str, Any]
     bridge.send(op="call_service", id=_CALL, service=service, type=kind, args=values)
     end = time.monotonic() + SECONDS
     while (left := end - time.monotonic()) > 0.0:
-        message = bridge.receive(left)
-        if message is not None and message.get("op") == "service_response" and (
-                message.get("id") == _CALL):
+        message = bridge.receive(left) or {}
+        if message.get("op") == "service_response" and message.get("id") == _CALL:
             answered = message.get("values")
             if message.get("result") and isinstance(answered, dict) and answered.get("success"):
                 return
             raise WorkError(f"{service} refused ({answered}).", "", "See the driver's log.")
-        if message is not None:
+        if message:
             take(message)
     raise WorkError(f"{service} gave no answer within {SECONDS:g} s.", "",
                     "Check its name with `ros2 service list`.")

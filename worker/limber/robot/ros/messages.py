@@ -20,6 +20,7 @@ STOP = "std_msgs/msg/Bool"
 END = "std_msgs/msg/Empty"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
+JOG = "control_msgs/msg/JointJog"
 STATUS_KINDS = {"safety_mode": "ur_dashboard_msgs/msg/SafetyMode",
                 "robot_mode": "ur_dashboard_msgs/msg/RobotMode",
                 "runtime_state": "std_msgs/msg/Bool", "slider": "std_msgs/msg/Float64"}
@@ -69,9 +70,8 @@ class JointStates:
             pose = pose_vectors(flange @ self._tool)
             speed = self._arm.jacobian(joints) @ speeds
             speed[:3] += np.cross(speed[3:], flange[:3, :3] @ self._tool[:3, 3])
-        return Sample(clock=stamp_of(message), arrived=arrived, joints=joints,
-                      joint_speeds=speeds, pose=pose, speed=speed, wrench=np.zeros(6),
-                      **status)
+        return Sample(clock=stamp_of(message), arrived=arrived, joints=joints, joint_speeds=speeds,
+                      pose=pose, speed=speed, wrench=np.zeros(6), **status)
 
     def _chosen(self, names: list[str]) -> list[int] | None:
         """Where the arm's joints are in a message's names, or None."""

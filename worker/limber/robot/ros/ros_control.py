@@ -1,10 +1,11 @@
 """A robot behind a rosbridge for the driver's loop: its samples and wrenches in, trajectories out.
 
-The controller in ROS follows a whole trajectory itself (FollowJointTrajectory); the loop judges
-where the arm is on it. Whatever ends a motion before its end, a stop by the guard, an error or
-Ctrl-C, cancels the goal and publishes the stop topic, until the controller confirms that the goal
-has ended. ``scripts/examples/ros2`` shows a node beside the controller that acts on that topic, and
-on silence: a websocket is no safety channel.
+The controller in ROS follows a whole trajectory itself (FollowJointTrajectory), and the loop judges
+where the arm is on it; or MoveIt Servo gets a stream of joint speeds (:class:`RosServo`). Whatever
+ends a motion before its end, a stop by the guard, an error or Ctrl-C, cancels the goal and
+publishes the stop topic, until the controller confirms that the goal has ended.
+``scripts/examples/ros2`` shows a node beside the controller that acts on that topic, and on
+silence: a websocket is no safety channel.
 """
 
 import socket
@@ -25,6 +26,7 @@ from limber.robot.ros.bridge import SECONDS, Bridge, call
 from limber.robot.ros.messages import (
     END,
     FOLLOW,
+    JOG,
     JOINT_STATE,
     RUNNING,
     STATUS_KINDS,
@@ -43,6 +45,7 @@ _REST_SECONDS, _LAST_SECONDS = 0.3, 1.0
 _STILL_RAD = 1e-3
 _SUCCEEDED = 4  # action_msgs/msg/GoalStatus
 _OFF_END_M = 0.02
+_RETURN_PER_S = 5.0  # share of the way off the path that a servo makes up
 _SEARCHED = 50  # rows ahead of the last place
 _PAYLOAD = "ur_msgs/srv/SetPayload"
 
@@ -369,6 +372,47 @@ class RosControl:
     def close(self) -> None:
         """Close the connection."""
         self._bridge.close()
+
+
+class RosServo(RosControl):
+    """The same robot by a stream of joint speeds (JointJog) to MoveIt Servo, which halts the arm a
+    tenth of a second after the last of them."""
+
+    silence, by_joints = 0.1, True
+    # No whole trajectories: it is no TrajectoryControl.
+    follow = progress = None  # type: ignore[assignment]
+
+    def __init__(self, cell: Cell, bridge: Bridge | None = None):
+        super().__init__(cell, bridge)
+        self._sent: tuple[np.ndarray, float] | None = None
+        self._bridge.advertise(self._topics.jog, JOG)
+
+    def servo_joints(self, joints: np.ndarray) -> bool:
+        """Send the speeds that bring the joints to their next angles [rad], shape [n], and back
+        onto the way."""
+        last = self._recent[-1]
+        before, since = self._sent or (last.joints, last.clock)
+        self._jog((joints - before) / max(last.clock - since, 1.0 / self.rate)
+                  + _RETURN_PER_S * (joints - last.joints))
+        self._sent = joints, last.clock
+        return True
+
+    def _jog(self, speeds: np.ndarray) -> None:
+        seconds, nanoseconds = divmod(round(1e9 * self._recent[-1].clock), 10**9)
+        self._bridge.send(op="publish", topic=self._topics.jog, msg={
+            "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": ""},
+            "joint_names": self._states.ordered, "displacements": [], "duration": 0.0,
+            "velocities": np.round(speeds, 6).tolist()})
+
+    def _take_stop(self, message: dict[str, Any]) -> None:
+        if message.get("data") and self._sent is not None:
+            raise SafetyStop("A stop was published.", f"It came on {self._topics.stop}.", "")
+
+    def end_motion(self) -> bool:
+        """Stop the joints."""
+        self._sent = None
+        self._jog(np.zeros(len(self._states.ordered)))
+        return True
 
 
 def _rests(trajectory: Trajectory) -> np.ndarray:

@@ -5,20 +5,22 @@ from dataclasses import dataclass, fields
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.robot.interface import require_sensor
-from limber.robot.ros.bridge import Bridge, send_gripper
+from limber.robot.ros.bridge import Bridge
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the robot's topics and actions, by default the UR driver's; ``safety_mode`` to
-    ``slider`` are what a UR arm's driver publishes of its controller, ``prefix`` that of its
-    joints' names."""
+    """Names of the robot's topics and actions, by default the UR driver's; ``output`` is trajectory
+    or servo, which streams to ``jog``; ``safety_mode`` to ``slider`` are what a UR arm's driver
+    publishes of its controller, ``prefix`` that of its joints' names."""
 
     prefix: str = ""
     joint_states: str = "/joint_states"
     wrench: str = "/force_torque_sensor_broadcaster/wrench"
+    output: str = "trajectory"
+    jog: str = "/servo_node/delta_joint_cmds"
     stop: str = "/limber/stop"
     end: str = "/limber/end"
     trajectory: str = "/scaled_joint_trajectory_controller/follow_joint_trajectory"
@@ -41,6 +43,9 @@ class Topics:
         if unknown := [name for name in stated if name not in known]:
             raise InputError(f"[robot.ros] states {', '.join(unknown)}.", "",
                              f"Known are namespace, {', '.join(known)}.")
+        if stated.get("output", "servo") not in ("trajectory", "servo"):
+            raise InputError(f"robot.ros.output is {stated['output']}.", "",
+                             "It is trajectory or servo.")
         return cls(**{name: f"/{space}{usual}" if space and usual.startswith("/") else usual
                       for name, usual in known.items()} | stated)
 
@@ -51,8 +56,10 @@ def grip_by_action(cell: Cell, bridge: Bridge, close: bool) -> None:
         raise InputError("Limber does not drive the cell's gripper through ROS.",
                          f"tool.gripper is {cell.tool.gripper}.", "Use ros or by_hand.")
     topics = Topics.of_cell(cell)
-    send_gripper(bridge, topics.gripper,
-                 float(topics.gripper_closed if close else topics.gripper_open))
+    position = float(topics.gripper_closed if close else topics.gripper_open)
+    bridge.send(op="send_action_goal", id="limber-gripper", action=topics.gripper, feedback=False,
+                action_type="control_msgs/action/GripperCommand",
+                args={"command": {"position": position, "max_effort": 0.0}})
 
 
 def is_ros(cell: Cell) -> bool:
@@ -73,9 +80,8 @@ def wrench_topic(cell: Cell, own: str = _USUAL.wrench) -> str:
     if sensor.topic is None:
         raise InputError(f"sensor.kind is {sensor.kind}, but the cell file states no sensor.topic.",
                          f"{own} is not that sensor: there the arm's driver publishes the "
-                         "controller's own force.",
-                         "Set sensor.topic to the topic on which the sensor's node publishes "
-                         f"{WRENCH}; `ros2 topic list -t` lists it.")
+                         "controller's own force.", "Set sensor.topic to the topic on which the "
+                         f"sensor's node publishes {WRENCH}; `ros2 topic list -t` lists it.")
     # Under a name space too.
     if cell.arm.controller == "ur" and sensor.topic.split("/")[-2:] == own.split("/")[-2:]:
         measures = cell.arm.measures_force

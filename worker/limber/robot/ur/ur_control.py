@@ -47,13 +47,11 @@ class UrControl(SampleStream):
         arm, calibrated = self._cell.arm, self._cell.robot.version
         if self.rate != arm.rate:
             raise InputError(f"The controller has version {version}, but the cell states "
-                             f"{arm.name}.",
-                             "They belong to different series of arms.",
-                             "Correct robot.model in the cell file.")
+                             f"{arm.name}.", "They belong to different series of arms.", "Correct "
+                             "robot.model in the cell file.")
         if calibrated and calibrated.split(".")[:2] != version.split(".")[:2]:
             raise InputError(f"The controller has version {version}, but the cell was calibrated "
-                             "with "
-                             f"{calibrated}.", "Settings of tool, kinematics and safety may "
+                             f"with {calibrated}.", "Settings of tool, kinematics and safety may "
                              "differ between versions.", "Calibrate again, or compare the settings "
                              "and correct robot.version in the cell file.")
         ask = self._dashboard.ask
@@ -66,13 +64,11 @@ class UrControl(SampleStream):
         known = model.lower()
         if known.startswith("ur") and known != arm.name.rstrip("e"):
             raise InputError(f"The robot reports that it is a {model}, but the cell file states "
-                             f"{arm.name}.",
-                             "Reach and limits would be those of another arm.",
+                             f"{arm.name}.", "Reach and limits would be those of another arm.",
                              "Correct robot.model in the cell file.")
         if facts["remote"] is False:
-            raise SafetyStop("The robot is not in remote control.",
-                             "It would not accept a program.",
-                             "Switch it to remote control on the pendant.")
+            raise SafetyStop("The robot is not in remote control.", "It would not accept a "
+                             "program.", "Switch it to remote control on the pendant.")
         return facts
 
     def connect(self) -> None:
@@ -82,9 +78,8 @@ class UrControl(SampleStream):
 
         if self._first.program_runs:
             raise SafetyStop("A program is running on the controller "
-                             f"({self._dashboard.ask('programState')}).",
-                             "Limber's own program would end it, wherever it is.",
-                             "Stop it on the pendant.")
+                             f"({self._dashboard.ask('programState')}).", "Limber's own program "
+                             "would end it, wherever it is.", "Stop it on the pendant.")
         tool = self._cell.tool
         self._control = RTDEControlInterface(self.address, self.rate)
         self._before["tool"] = self._control.getTCPOffset()
@@ -159,10 +154,9 @@ class UrControl(SampleStream):
                     and self._control.setPayload(*before["payload"]))
         except RuntimeError:
             done = False
-        return None if done else (
-            "The controller keeps the tool centre point and payload of the cell file: its program "
-            "had ended before they could be put back. Set them on the pendant if another program "
-            "needs others.")
+        return None if done else ("The controller keeps the tool centre point and payload of the "
+                                  "cell file: its program had ended before they could be put back. "
+                                  "Set them on the pendant if another program needs others.")
 
     def close(self) -> None:
         """Release the robot."""
@@ -182,10 +176,9 @@ def _first_sample(stream: SampleStream) -> Sample:
         raise WorkError("The robot sends no data.", "", "Restart its controller.")
     sample = samples[-1]
     if sample.safety_mode != 1 or sample.robot_mode != 7:
-        raise SafetyStop(f"The robot is not ready: safety mode {sample.safety_mode}, robot "
-                         f"mode {sample.robot_mode}.", "Limber neither releases stops nor "
-                         "switches an arm on.",
-                         "Check the robot, then release or switch it on at the pendant.")
+        raise SafetyStop(f"The robot is not ready: safety mode {sample.safety_mode}, robot mode "
+                         f"{sample.robot_mode}.", "Limber neither releases stops nor switches an "
+                         "arm on.", "Check the robot, then release or switch it on at the pendant.")
     return sample
 
 

@@ -598,11 +598,9 @@ def _six(joints: Sequence[float] | np.ndarray) -> np.ndarray:
     that RTDE supports."""
     angles = np.array(joints, float)
     if angles.shape != (6,) or not np.isfinite(angles).all():
-        raise InputError("The joint angles are "
-                         f"{joints}.", "Six finite numbers [rad] are needed, because "
-                         "the virtual controller imitates that of a six-joint arm of Universal "
-                         "Robots.",
-                         "Give one angle per joint.")
+        raise InputError(f"The joint angles are {joints}.", "Six finite numbers [rad] are needed, "
+                         "because the virtual controller imitates that of a six-joint arm of "
+                         "Universal Robots.", "Give one angle per joint.")
     return angles
 
 

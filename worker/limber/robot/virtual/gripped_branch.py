@@ -256,8 +256,7 @@ class HeldBranch(Load):
             got, content = self._pipe.recv()
         except EOFError as error:
             raise InputError(f"The branch {self.setting.mesh} cannot be held because its solver "
-                             "ended.",
-                             "See its output.") from error
+                             "ended.", "See its output.") from error
         assert got == kind
         return content
 
