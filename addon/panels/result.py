@@ -6,7 +6,6 @@ from .. import compat, preferences
 from ..bend import live_loads
 from ..branch import branches
 from ..bridge.materials import WOOD
-from ..jobs import warming
 from ..plan import energy_field
 from ..show import graph as viewport_graph
 from ..show import seeing
@@ -26,7 +25,6 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
     bl_order = 2
 
     def draw_header_preset(self, context):
-        warming.draw(self.layout)
         guide.draw(self.layout, "result")
 
     def draw(self, context):

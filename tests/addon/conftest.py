@@ -240,13 +240,6 @@ def has_worker(extension_zip) -> bool:
 
 
 @pytest.fixture(scope="session")
-def has_kernels(extension_zip) -> bool:
-    """Whether the zip brings the worker's compiled kernels along."""
-    with zipfile.ZipFile(extension_zip) as content:
-        return any(name.startswith("wheels/limber_kernels-") for name in content.namelist())
-
-
-@pytest.fixture(scope="session")
 def environment(tmp_path_factory, worker_python, has_worker) -> dict[str, str]:
     """An environment whose Blender keeps its settings in a folder of the test, with our worker or
     with none but the zip's own."""

@@ -4,7 +4,6 @@ import importlib.machinery
 import importlib.util
 import json
 import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -105,31 +104,6 @@ def test_the_workers_numpy_is_found_by_the_worker_alone(build, tmp_path):
         [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(folder)!r}); import numpy; "
          "print(numpy.__version__)"], check=True, capture_output=True, text=True)
     assert blender.stdout.strip() != "9.9"
-
-
-def test_kernels_are_compiled_where_the_zip_is_to_run(build, tmp_path, monkeypatch, capsys):
-    """By the worker, with a Python of the zip's version, on the zip's system; else not at all."""
-    monkeypatch.setenv("LIMBER_TEST_PYTHON", "no-such-python")
-    own = ".".join(map(str, sys.version_info[:2]))
-    assert build.python_of(own) == sys.executable and build.python_of("2.0") is None
-    system = next((name for name, about in build.MARKERS.items()
-                   if about[2:] == (platform.system(), platform.machine())), None)
-    for other, version in ((next(name for name in build.MARKERS if name != system), own),
-                           (system or "linux-x64", "2.0")):
-        build.compiled_kernels(tmp_path, other, version)
-        assert "NOT in the zip: compiled kernels" in capsys.readouterr().err
-    if system is None:
-        pytest.skip("no zip is for this system")
-    for name in ("limber_branch-1.0-py3-none-any", "llvmlite-1.0-cp311-cp311-any"):
-        _wheel(tmp_path, f"{name}.whl")
-    (tmp_path / "bundled.py").write_text(
-        "import os, pathlib, sys\n"
-        "folder = pathlib.Path(os.environ['NUMBA_CACHE_DIR'])\nfolder.mkdir()\n"
-        "(folder / 'a.nbc').write_text(' '.join(sys.argv[2:]))\n")
-    monkeypatch.setattr(build, "ADDON", tmp_path)
-    build.compiled_kernels(tmp_path, system, own)
-    with zipfile.ZipFile(tmp_path / "limber_kernels-1.0-cp311-cp311-any.whl") as made:
-        assert made.read("limber_kernels/a.nbc") == b"doctor --warm"
 
 
 def test_the_zip_is_for_the_blenders_with_its_python(build):

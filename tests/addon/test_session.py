@@ -87,14 +87,6 @@ def test_what_it_cannot_use_is_said(started, first, words):
     assert words in session.error
 
 
-def test_that_it_compiles_is_said(started):
-    session = started([sys.executable, "-c",
-                       SCRIPT.format(first=json.dumps({"event": "compiling"}))])
-    assert session.message == "loading the branch"
-    until(session, lambda _: "compiling" in session.message, 20.0)
-    assert "compiling" in session.message and not session.error
-
-
 def test_a_killed_session_is_told(started):
     """And what is sent afterwards does no harm."""
     session = started([sys.executable, "-c", SCRIPT.format(first="rubbish among the lines")])

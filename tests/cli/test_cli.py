@@ -276,14 +276,14 @@ def test_a_forgotten_output_is_named_after_the_input(capfd):
         "scans: where to make the branch folders. Add, for example: -o ten.branch\n")
 
 
-HEAVY = {"numpy", "pydantic", "scipy", "numba", "rich", "trimesh", "matplotlib"}
+HEAVY = {"numpy", "pydantic", "scipy", "rich", "trimesh", "matplotlib"}
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
     """`limber --help` loads none of the packages that take long; a stage's no numerical one."""
     program = "import sys; from limber.cli import main\n"
     for arguments, heavy in (([], HEAVY), *(
-            ([stage], {"scipy", "numba", "trimesh", "matplotlib"}) for stage in (
+            ([stage], {"scipy", "trimesh", "matplotlib"}) for stage in (
                 "simulate", "estimate"))):
         program += (f"assert main.call({[*arguments, '--help']}) == 0\n"
                     f"assert not {heavy} & set(sys.modules), {heavy} & set(sys.modules)\n")
@@ -472,13 +472,13 @@ def test_a_bug_report_of_a_scan(tmp_path, capsys):
 
 def test_doctor_names_what_is_wrong_with_a_cache(tmp_path, monkeypatch, capsys):
     """Empty files, and a disk without room."""
-    (tmp_path / "numba").mkdir()
-    (tmp_path / "numba" / "a.nbi").write_bytes(b"")
-    (tmp_path / "numba" / "b.nbi").write_bytes(bytes(2_000_000))
+    (tmp_path / "tetrahedra").mkdir()
+    (tmp_path / "tetrahedra" / "a.npz").write_bytes(b"")
+    (tmp_path / "tetrahedra" / "b.npz").write_bytes(bytes(2_000_000))
     monkeypatch.setattr(caches, "cache_folder", lambda: tmp_path)
     assert call(["doctor", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["caches"]["numba"]
+    told = json.loads(capsys.readouterr().out)["caches"]["tetrahedra"]
     assert told.startswith("2 files, 2 MB; 1 of them empty")
     monkeypatch.setattr("shutil.disk_usage", lambda _place: SimpleNamespace(free=5e6))
     assert call(["doctor", "--json"]) == 0
-    assert "its disk has 5 MB left" in json.loads(capsys.readouterr().out)["caches"]["numba"]
+    assert "its disk has 5 MB left" in json.loads(capsys.readouterr().out)["caches"]["tetrahedra"]

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force
 
 from limber.core.errors import WorkError
@@ -296,3 +297,35 @@ def test_left_out_twigs_weigh_on_the_branch_that_is_fitted(branch_folder):
     base = [solve_static(model.with_parameters(**stiff)).require().base_force[2]
             for model in (bare, loaded)]
     assert base[1] - base[0] == pytest.approx(0.02 * 9.80665, rel=1e-6)
+
+
+def test_bent_beams_are_those_of_the_plain_form():
+    """Each section turns by the moment at its middle, which half of that at its begin leads to."""
+    rng, sections = np.random.default_rng(3), 5
+    axis = np.linspace(0.0, 0.3, sections + 1)[:, None] * [0.1, 0.2, 1.0]
+    bending, twist = rng.uniform(0.05, 0.2, (2, 1, sections))
+    force, grasp, torque = rng.normal(size=(1, 2, 3)), rng.normal(size=(1, 2, 3)), rng.normal(
+        size=(2, 3))
+    weight, held = 0.1 * rng.normal(size=(2, sections + 1, 3))
+    hung = 0.01 * rng.normal(size=(1, 2, sections + 1, 3))
+    places, turns = np.empty((1, 2, sections + 1, 3)), np.empty((1, 2, sections + 1, 3, 3))
+    initial_modulus._bend_rods(axis, bending, twist, force, torque, grasp, weight, hung, held,
+                               places, turns)
+    for k in range(2):
+        place, turned = axis[0], Rotation.identity()
+        for s in range(sections):
+            step = axis[s + 1] - axis[s]
+            half, at, length = turned, place, np.linalg.norm(step)
+            for middle in (axis[s], axis[s] + step / 2):
+                moment = (np.cross(grasp[0, k] - at, force[0, k]) + torque[k] + hung[0, k, s + 1]
+                          - np.cross(at, weight[s + 1])
+                          - half.apply(held[s + 1] - np.cross(middle, weight[s + 1])))
+                tangent = half.apply(step) / length
+                along = (moment @ tangent) * tangent
+                turn = length * ((moment - along) / bending[0, s] + along / twist[0, s])
+                turn /= 2 * max(np.linalg.norm(turn), 1.0)
+                half = Rotation.from_rotvec(turn) * turned
+                at = place + half.apply(step) / 2
+            place, turned = 2 * at - place, Rotation.from_rotvec(2 * turn) * turned
+            np.testing.assert_allclose(places[0, k, s + 1], place, atol=1e-12)
+            np.testing.assert_allclose(turns[0, k, s + 1], turned.as_matrix(), atol=1e-12)

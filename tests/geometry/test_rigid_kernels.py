@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from limber.core.constants import STANDARD_GRAVITY
 from limber.core.numerics import rigid
 from limber.geometry import rigid_kernels
 
@@ -22,6 +23,19 @@ def test_they_are_those_of_arrays():
         turn = Rotation.from_rotvec(angle * np.array([0.6, 0.0, 0.8])).as_matrix()
         back = rigid_kernels.rotation_vector(turn)
         assert rigid.rotation_matrix(back) == pytest.approx(turn, abs=1e-9)
+
+
+def test_wrenches_are_those_of_the_formulas():
+    rng = np.random.default_rng(3)
+    turn, centre, force, moment, lever = Rotation.random(random_state=4).as_matrix(), *rng.normal(
+        size=(4, 3))
+    wrench = np.concatenate([force, moment])
+    weight = turn.T @ [0.0, 0.0, -2.0 * STANDARD_GRAVITY]
+    assert rigid_kernels.weight_wrench(2.0, centre, turn) == pytest.approx(
+        np.concatenate([weight, np.cross(centre, weight)]))
+    assert rigid_kernels.turned_wrench(turn, wrench, lever) == pytest.approx(np.concatenate(
+        [turn @ force, turn @ moment + np.cross(lever, turn @ force)]))
+    assert rigid_kernels.length(force) == pytest.approx(np.linalg.norm(force))
 
 
 def test_arrays_of_any_strides_and_numbers_are_read():

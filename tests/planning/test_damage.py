@@ -8,6 +8,7 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.progress import Progress
+from limber.planning.constraints import damage
 from limber.planning.constraints.damage import DamageAlong, Strength, assumed, read_break_tests
 from limber.planning.constraints.limits import Limits
 from limber.planning.settings import PlanSpec
@@ -165,3 +166,15 @@ def test_the_branch_is_drawn_where_it_would_break(small_model, small_skeleton, t
     (tmp_path / "damage.csv").write_text("x_m,y_m,z_m,parent,strain\n0,0,0,1,0.1\n0,0,1,0,0.1\n")
     with pytest.raises(InputError, match="does not come before its node"):
         DamageAlong.read(tmp_path / "damage.csv")
+
+
+def test_fitted_weibulls_are_scipy_s():
+    """The likeliest shape and scale of each row of strains, which scipy seeks by a simplex."""
+    strains = broken_at((3, 9), np.random.default_rng(5))
+    for row, shape, scale in zip(strains, *damage._fitted(np.log(strains)), strict=True):
+        theirs = scipy.stats.weibull_min.fit(row, shape, floc=0, scale=scale)
+        np.testing.assert_allclose([shape, scale], np.array(theirs)[[0, 2]], rtol=1e-3)
+        power = row**shape
+        assert power @ np.log(row) / power.sum() - 1 / shape == pytest.approx(
+            np.log(row).mean(), rel=1e-11)
+        assert scale == pytest.approx(power.mean()**(1 / shape))

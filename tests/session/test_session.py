@@ -146,7 +146,6 @@ def test_a_strange_client_needs_no_limber(branch_folder):
         [sys.executable, "-m", "limber.session.worker", str(branch_folder), "--settings",
          '{"reduced": false}'],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    # After an installation another event says first that kernels are compiled.
     hello = next(event for event in map(json.loads, process.stdout) if event["event"] == "hello")
     process.stdin.write(json.dumps({"command": "move", "id": 1, "pose": hello["rest_pose"]}) + "\n")
     process.stdin.flush()

@@ -30,7 +30,7 @@ from limber.core.errors import LimberError, PartlyFailedError, SafetyStop, Text,
 from limber.core.json_values import plain, stored
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
-from limber.core.progress import BarSink, JsonSink, LogSink, Progress, report_damage_to
+from limber.core.progress import BarSink, JsonSink, LogSink, Progress
 from limber.stages.command_line import (
     GroupedCommand,
     GroupedOption,
@@ -140,7 +140,6 @@ class StageCommand(GroupedCommand):
                 sink = JsonSink()
                 around.enter_context(Heartbeat(sink.say))
             progress = Progress(sink, on_warning, (lambda _line: None) if is_quiet else told)
-            around.enter_context(report_damage_to(progress.warn))
             yield progress
 
 

@@ -222,10 +222,6 @@ class SafetyStop(LimberError):
     exit_code = 4
 
 
-class DamagedCacheWarning(UserWarning):
-    """A cached file could not be used."""
-
-
 class Cancelled(LimberError):
     """The user stopped the work (exit code 130); earlier results are unchanged."""
 

@@ -15,11 +15,10 @@ import json
 import sys
 import threading
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, TextIO
 
-from limber.core.errors import Cancelled, DamagedCacheWarning, Part, Text
+from limber.core.errors import Cancelled, Part, Text
 
 Sink = Callable[[float, str, dict[str, Any]], None]
 
@@ -230,23 +229,3 @@ def _figures(numbers: dict[str, Any]) -> str:
 
 def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-@contextlib.contextmanager
-def report_damage_to(tell: Callable[[str], None]) -> Iterator[None]:
-    """Pass the first warning about a damaged cache, which comes from a lower layer, to ``tell``: of
-    others, usually damaged too, the user need not hear."""
-    reported: list[str] = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", DamagedCacheWarning)
-        default_show = warnings.showwarning
-
-        def show(message: Warning | str, category: type[Warning], *location: Any,
-                 **more: Any) -> None:
-            if not issubclass(category, DamagedCacheWarning):
-                default_show(message, category, *location, **more)
-            elif not reported:
-                reported.append(str(message))
-                tell(reported[0])
-        warnings.showwarning = show
-        yield

@@ -45,8 +45,6 @@ Events, one JSON object a line on standard output; a client may leave them unrea
 - ``{"event": "hello", "protocol": 2, "limber", "positions": PATH, "vertex_count", "control_count",
   "targets", "grasps", "rest_pose", "young_pa", "gravity_on", "extent_m"}``: frames are in the file
   PATH (limber.session.frame_buffer); the first shows the rest shape.
-- ``{"event": "compiling"}``: before ``hello``, if code has to be compiled first: once after an
-  installation, for up to a minute.
 - ``{"event": "reply", "id", "command", ...}`` and ``{"event": "error", "id", "command",
   "message"}``: the answer to a command. An invalid command also gets an error and has no effect.
 - ``{"event": "progress", "progress", "message"}``: a reduced model of the held branch is being
@@ -86,7 +84,6 @@ import numpy as np
 
 from limber.core.errors import Cancelled, InputError, LimberError
 from limber.core.json_values import plain
-from limber.core.numerics.compiled import when_compiling
 from limber.core.processes import Pool
 from limber.core.progress import Progress
 from limber.mechanics.added_masses import PointMass
@@ -337,7 +334,6 @@ class Session:
     def __init__(self, folder: Path, settings: SessionSettings):
         self.inbox = Inbox()
         self.events = Events(self.inbox.close)
-        when_compiling(lambda: self.events.say(event="compiling"))
         self.held = load_held(folder, settings, Progress(
             on_warning=lambda message: self.events.say(event="warning", message=message)))
         self.answering = Answering(folder, settings, self.held, self.inbox.put, self.events.say)

@@ -25,7 +25,7 @@ RESULTS = "results"
 """Among a stage's programs: the version of its settings' results; see limber.core.settings."""
 REPORT = "report"
 """The stage that shows the results of all others."""
-_PROGRAMS = ("numpy", "scipy", "numba", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
+_PROGRAMS = ("numpy", "scipy", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
 
 
 class FileEntry(BaseModel):

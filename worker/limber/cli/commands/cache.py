@@ -9,7 +9,7 @@ from limber.stages.stage import About, Tool, option
 
 
 class Cache(Tool):
-    """Show what is cached (meshes, reduced models, compiled code), or trim it.
+    """Show what is cached (meshes, reduced models), or trim it.
 
     No result is among it: branch folders do not need it.
     """

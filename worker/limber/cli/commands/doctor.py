@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from limber.core.optional import how_to_install
 from limber.core.progress import SILENT, Progress
-from limber.stages.stage import About, Tool, option
+from limber.stages.stage import About, Tool
 
 if TYPE_CHECKING:
     from limber.core.files.caches import Cache
@@ -23,7 +23,6 @@ _LEAST_FREE_BYTES = 200e6
 PARTS = [
     ("numpy", "numpy", None, ""),
     ("scipy", "scipy", None, ""),
-    ("numba", "numba", None, ""),
     ("cvxopt", "cvxopt",
      "fast factorisation; without it SuperLU is used, about 4 times slower", ""),
     ("robust_laplacian", "robust_laplacian", "skeletons of scans", ""),
@@ -63,13 +62,7 @@ class Doctor(Tool):
     about = About("doctor", found=("Python {python}, {cores} cores, {system}.", _packages,
                                    "Blender: {blender}"))
 
-    warm: bool = option("Compile the solver's kernels now, not at first use.", False, switch=True)
-
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
-        if self.warm:
-            from limber.planning.warm_up import warm_up
-
-            warm_up(progress)
         return report()
 
 
@@ -94,7 +87,7 @@ def report() -> dict[str, Any]:
 
 
 def _cache_summary(cache: "Cache") -> str:
-    """Size of a cache and its faults; `--warm` also reads its content."""
+    """Size of a cache and its faults."""
     parts = [f"{cache.file_count} files, {cache.byte_count / 1e6:.0f} MB"]
     if not os.access(cache.folder, os.W_OK):
         parts.append(f"{cache.folder} cannot be written: nothing is kept, every run computes it")

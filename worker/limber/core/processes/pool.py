@@ -14,7 +14,6 @@ import signal
 import threading
 import time
 import traceback
-import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
@@ -25,7 +24,7 @@ from multiprocessing.connection import wait as wait_for_any
 from threading import Event, Lock, Thread
 from typing import Any
 
-from limber.core.errors import Cancelled, DamagedCacheWarning, LimberError, WorkError
+from limber.core.errors import Cancelled, LimberError, WorkError
 from limber.core.not_none import present
 from limber.core.processes.end_with_parent import end_by_kernel
 from limber.core.processes.process_limits import (
@@ -37,7 +36,7 @@ from limber.core.processes.process_limits import (
     kill_tree,
     worker_count,
 )
-from limber.core.progress import SILENT, Progress, report_damage_to
+from limber.core.progress import SILENT, Progress
 
 # Main loop of a pool process: it takes tasks from its pipe until the pipe closes.
 
@@ -74,13 +73,6 @@ class Reported:
 
 
 @dataclass(frozen=True)
-class CacheDamaged:
-    """A warning about a damaged cache, from any code in the process."""
-
-    message: str
-
-
-@dataclass(frozen=True)
 class Returned:
     """A task's result."""
 
@@ -107,12 +99,6 @@ def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) ->
     tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
     voice = _Voice(pipe)
     threading.Thread(target=_receive, args=(pipe, tasks, voice), daemon=True).start()
-    with report_damage_to(lambda message: voice.say(CacheDamaged(message))):
-        _work(tasks, voice, begin)
-
-
-def _work(tasks: "queue.SimpleQueue[Task]", voice: "_Voice",
-          begin: tuple[Callable | None, tuple]) -> None:
     try:
         if begin[0] is not None:
             begin[0](*begin[1])
@@ -449,8 +435,6 @@ class Pool:
     def _take(self, worker: Worker, message: Any) -> None:
         if isinstance(message, Began):
             worker.has_begun = True
-        elif isinstance(message, CacheDamaged):
-            warnings.warn(message.message, DamagedCacheWarning, stacklevel=2)
         elif isinstance(message, Reported) and worker.job is not None:
             worker.job.report(message)
         elif isinstance(message, Returned) and worker.job is not None:

@@ -63,7 +63,7 @@ class Driver:
         sensor = open_sensor(cell, self._control)
         self.guard = guard_of(cell, self._control.rate)
         level = _warm_up(cell, self._control, sensor)
-        # Now: if it has just compiled, this takes longer than the watchdog would wait.
+        # Now: if it has just loaded much, this takes longer than the watchdog would wait.
         self.facts = self._control.facts | {
             "real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
             "kept_awake": keep_awake()}
@@ -339,7 +339,7 @@ def _ordered(order: dict[str, Any]) -> Trajectory:
 
 
 def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> np.ndarray | None:
-    """Run the loop's functions once: compiling during a motion would starve the watchdog. Return
+    """Run the loop's functions once: loading during a motion would starve the watchdog. Return
     the level of the controller's own sensor, as :meth:`.WrenchChain.level`."""
     samples: list[Sample] = []
     while len(samples) < LEVEL_READINGS:

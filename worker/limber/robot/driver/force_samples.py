@@ -427,7 +427,7 @@ def guard_of(cell: Cell, rate: float) -> Guard:
 
 
 def rehearse(cell: Cell, sample: Sample, reading: Reading) -> None:
-    """Judge a sample once: compiling or loading must not delay a motion."""
+    """Judge a sample once: loading must not delay a motion."""
     guard = guard_of(cell, cell.arm.rate)
     guard.tared(np.zeros((3, 3)))
     guard.hold(np.zeros(3))

@@ -107,7 +107,7 @@ def serve(controller: Controller, address: str, *, control: bool = False,
 
 
 def _warm_up(controller: Controller) -> None:
-    """Do beforehand what would stop the clock: compiling, for seconds, and full collections."""
+    """Do beforehand what would stop the clock: loading, and full collections."""
     nearest_joints(controller.arm, controller.pose, controller.tool, controller.joints)
     Servo().step(controller.joints, controller.speeds, controller.seconds, 1.0)
     spare_what_is_loaded()
