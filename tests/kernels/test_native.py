@@ -37,7 +37,7 @@ def test_declarations_are_the_functions():
                 "utf-8"), re.M | re.S):
             defined[name] = kind, [re.match(r"(?:const )?(\w+\*?)", word.strip())[1]
                                    for word in words.split(",") if word]
-    del defined["has_wide_vectors"]
+    del defined["has_wide_vectors"], defined["arrays_fit"]
     importlib.import_module("limber.robot.virtual.step_kernels")
     for name, arguments in SMALL_KERNELS.items():
         wanted = ["char*" if "[" in part else "double" for part in arguments]
@@ -62,6 +62,15 @@ def test_other_arrays_are_refused(number, value):
     arrays[number] = value
     with pytest.raises(TypeError, match="kernel sparse_times wants starts int32"):
         sparse_times(*arrays)
+
+
+def test_what_is_no_array_is_refused():
+    """Lists, numbers, nothing; and byte orders of other machines."""
+    good = [np.array([0, 1], np.int32), np.array([0], np.int32), np.ones(1), np.ones((1, 3)),
+            np.empty((1, 3))]
+    for number, value in ((0, [0, 1]), (2, 1.0), (4, None), (2, np.ones(1, ">f8"))):
+        with pytest.raises(TypeError, match="kernel sparse_times wants"):
+            sparse_times(*good[:number], value, *good[number + 1:])
 
 
 def digits() -> str:

@@ -11,6 +11,7 @@ struct Array {
   const int64_t* strides;
   const void* owner;
   const char* numbers;  // an object too: behind its head and a pointer, the numbers' kind, letter and byte order
+  int32_t flags;        // 1: in C order, 1024: writeable
 };
 
 // The arguments of one call: `head` is the size of an object's head, whose last word is the object's type. `result`
