@@ -94,18 +94,30 @@ KERNEL void green_changed(const double* H, const double* D, const int64_t* owner
                           int64_t points, int64_t states, int64_t fields) {
   constexpr int kPairs[6][2] = {{0, 0}, {1, 1}, {2, 2}, {0, 1}, {0, 2}, {1, 2}};
   const double shear = sqrt(0.5);
-  for (int64_t p = 0; p < points; ++p)
-    for (int64_t f = 0; f < fields; ++f) {
-      double h[3][3], d[3][3];
+  auto part = [=](auto h, auto d, int k) {
+    const int i = kPairs[k][0], j = kPairs[k][1];
+    auto total = d(i, j) + d(j, i);
+    for (int c = 0; c < 3; ++c) total += h(c, i) * d(c, j) + d(c, i) * h(c, j);
+    return total * (k < 3 ? 0.5 : shear);
+  };
+  for (int64_t p = 0; p < points; ++p) {
+    const double *state = H + 9 * p * states, *change = D + 9 * p * fields;
+    double* out = strain + 6 * p * fields;
+    int64_t f = 0;
+    for (; f + kLanes <= fields; f += kLanes) {
+      const int64_t* own = owners + f;
+      Lanes h[9], d[9];
       for (int k = 0; k < 9; ++k) {
-        h[k / 3][k % 3] = H[(9 * p + k) * states + owners[f]];
-        d[k / 3][k % 3] = D[(9 * p + k) * fields + f];
+        const double* row = state + k * states;
+        h[k] = Lanes{row[own[0]], row[own[1]], row[own[2]], row[own[3]]};
+        d[k] = load(change + k * fields + f) * load(scales + f);
       }
-      for (int k = 0; k < 6; ++k) {
-        const int i = kPairs[k][0], j = kPairs[k][1];
-        double total = d[i][j] + d[j][i];
-        for (int c = 0; c < 3; ++c) total += h[c][i] * d[c][j] + d[c][i] * h[c][j];
-        strain[(6 * p + k) * fields + f] = scales[f] * total * (k < 3 ? 0.5 : shear);
-      }
+      for (int k = 0; k < 6; ++k)
+        store(out + k * fields + f, part([&](int c, int i) { return h[3 * c + i]; }, [&](int c, int i) { return d[3 * c + i]; }, k));
     }
+    for (; f < fields; ++f)
+      for (int k = 0; k < 6; ++k)
+        out[k * fields + f] = part([&](int c, int i) { return state[(3 * c + i) * states + owners[f]]; },
+                                   [&](int c, int i) { return change[(3 * c + i) * fields + f] * scales[f]; }, k);
+  }
 }

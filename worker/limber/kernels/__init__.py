@@ -120,4 +120,4 @@ _ITEMS = tuple.__basicsize__
 
 def for_kernels(array: np.ndarray) -> np.ndarray:
     """Return floats in C order, which kernels take."""
-    return np.require(array, float, "C")
+    return np.ascontiguousarray(array, float)
