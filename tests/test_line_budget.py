@@ -42,9 +42,8 @@ def parts() -> dict[str, list[Path]]:
 def test_lines_of_code_only_fall(name: str):
     lines = sum(code_lines(path.read_text(encoding="utf-8")) for path in parts()[name])
     budget = BUDGET["lines"].get(name, 0)
-    assert lines <= budget, (
-        f"{name} has {lines} lines of code, its budget is {budget}. Replace what the new lines do "
-        "again, or take them from another place.")
+    assert lines <= budget, (f"{name} has {lines} lines of code, its budget is {budget}. Replace "
+                             "what the new lines do again, or take them from another place.")
     assert budget <= lines + SLACK, (
         f"{name} has {lines} lines of code. Lower its budget of {budget} (line_budget.toml).")
 

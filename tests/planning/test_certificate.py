@@ -452,9 +452,8 @@ def test_costs_of_two_seeds_compare(ridge_field):
     assert first.lower == pytest.approx(second.lower, rel=0.01)
     assert first.upper <= second.upper * (1 + 1e-9)
     assert max(first.lower, second.lower) <= first.upper
-    assert set(found[0].compared) == {
-        "straight line", "eikonal", "RRT*", "RRT*, not smoothed", "D-RRT*",
-        "D-RRT*, not smoothed"}
+    assert set(found[0].compared) == {"straight line", "eikonal", "RRT*", "RRT*, not smoothed",
+                                      "D-RRT*", "D-RRT*, not smoothed"}
 
 
 def test_bounds_together_are_those_of_each_alone_and_ask_the_field_once(ridge_field, monkeypatch):

@@ -297,9 +297,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if "worker_address" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.real_time)
         if item.get_closest_marker("real_time") is not None:
-            item.add_marker(pytest.mark.skipif(
-                not may_use_two_processors(),
-                reason="real time: a robot and its driver want a processor each"))
+            item.add_marker(pytest.mark.skipif(not may_use_two_processors(), reason="real time: a "
+                                               "robot and its driver want a processor each"))
             item.add_marker(pytest.mark.flaky(
                 reruns=4, condition=Watch.saw_the_machine_stand_still))
 

@@ -147,9 +147,8 @@ def test_the_legs_of_a_motion_stand_in_order():
             "branch_distance_m": -0.004}
     hold = {"name": "hold", "start_s": 16.2, "duration_s": 2.0, "length_m": 0.0,
             "peak_speed_m_s": 0.0, "peak_force_n": 1.2}
-    assert leg_rows([path, hold])[1:] == [
-        ["path", "4.0", "12.2", "200", "20", "1.23", "100", "-4"],
-        ["hold", "16.2", "2.0", "", "", "1.2", "", ""]]
+    assert leg_rows([path, hold])[1:] == [["path", "4.0", "12.2", "200", "20", "1.23", "100", "-4"],
+                                          ["hold", "16.2", "2.0", "", "", "1.2", "", ""]]
     assert leg_rows([]) == []
 
 
