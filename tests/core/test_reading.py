@@ -33,9 +33,10 @@ from limber.recordings.tables import text_of
 
 @pytest.mark.parametrize("text", [
     "NaN", "[Infinity]", "[1e400]", "[-1e30]", "[" + "9" * 50 + "]", "{", "[" * 100_000,
-    '{"a": ' + "9" * 400 + "}", "\xff"])
+    '{"a": ' + "9" * 400 + "}", "\xff", r'["\uD83C"]', r'{"\udf3f": 1}'])
 def test_json_that_is_refused(tmp_path, text):
-    """Numbers that are not finite, endless nesting, endless digits, no text: one clear error."""
+    """Numbers that are not finite, endless nesting, endless digits, no text, half a character: one
+    clear error."""
     path = tmp_path / "a.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=r"a\.json"):

@@ -70,15 +70,19 @@ def read_text(path: str | os.PathLike, what: str, most_bytes: int = 512 << 20) -
 
 
 def read_json(path: str | os.PathLike, what: str) -> Any:
-    """Return the content of a JSON file; InputError if it is not JSON, or a number is not finite,
-    or beyond ``LARGEST_NUMBER``."""
+    """Return the content of a JSON file; InputError if it is not JSON, or has half a character; or
+    if a number is not finite, or beyond ``LARGEST_NUMBER``."""
     return json_content(read_text(path, what), path, what)
 
 
 def json_content(text: str, path: str | os.PathLike, what: str) -> Any:
     """Return the content of a JSON text read from ``path``; InputError as :func:`read_json`."""
     try:
-        return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_integer)
+        content = json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_integer)
+        if re.search(r"\\u[dD]", text):
+            # Half of a character, which no file could hold: a ValueError.
+            json.dumps(content, ensure_ascii=False).encode()
+        return content
     except (ValueError, RecursionError) as error:
         raise unreadable(path, what, error) from error
 
