@@ -37,20 +37,20 @@ _PLAIN = {"int": ctypes.c_int64, "float": ctypes.c_double, "": None}
 def library() -> ctypes.CDLL:
     """Return the library for this system and processor. In a checkout it is built if a source has
     changed. With ``LIMBER_KERNELS=v2`` it is that for processors without AVX2."""
-    if FOLDER.parents[1].name == "worker" and (_SOURCES / "build.py").is_file():
-        runpy.run_path(str(_SOURCES / "build.py"))["build"](FOLDER)
     system, ending = _SYSTEMS.get(sys.platform, (sys.platform, "so"))
     machine = _MACHINES.get(platform.machine().lower(), platform.machine())
     try:
+        if FOLDER.parents[1].name == "worker" and (_SOURCES / "build.py").is_file():
+            runpy.run_path(str(_SOURCES / "build.py"))["build"](FOLDER)
         plain = ctypes.CDLL(str(FOLDER / f"{system}-{machine}.{ending}"))
         if plain.has_wide_vectors() and os.environ.get("LIMBER_KERNELS") != "v2":
             return ctypes.CDLL(str(FOLDER / f"{system}-{machine}-v3.{ending}"))
         return plain
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise MissingDependencyError(
             f"Limber's compiled kernels do not load: {error}.",
-            "Install Limber from its wheel, or on a machine with a C++ compiler (g++, clang++, or "
-            "the package ziglang) from its sources.") from error
+            "In a checkout run scripts/setup, which brings a compiler where there is none. Else "
+            "install Limber from its wheel.") from error
 
 
 class Kernel:
