@@ -199,7 +199,8 @@ def differs(group: Any, stage: Stage, settings: dict[str, Any]) -> bool:
         elif stage.fields[name].kind in ("number", "vector"):
             if np.float32(value).tolist() != np.float32(before).tolist():
                 return True
-        elif _numbers(value) != _numbers(stage.fields[name].shown(before)):
+        elif value != (given := stage.fields[name].shown(before)) and (
+                _numbers(value) != _numbers(given)):
             return True
     return False
 

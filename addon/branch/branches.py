@@ -185,14 +185,17 @@ def activate(scene: bpy.types.Scene, thing: bpy.types.Object | None) -> None:
 
 def remember(scene: bpy.types.Scene, *_: object) -> None:
     """Keep the folder of the active object: it stays the current one when a lamp is selected."""
-    path = _path_of_active(scene)
+    _, path = _of_active(scene)
     if path and scene.get(FOLDER_KEY) != path:
         scene[FOLDER_KEY] = path
 
 
 def _current(scene: bpy.types.Scene) -> tuple[bpy.types.Collection | None, str]:
     """Return the collection of the current branch, None if it is not shown, and its folder."""
-    path = _path_of_active(scene) or scene.get(FOLDER_KEY)
+    branch, path = _of_active(scene)
+    if branch is not None and branch.library is None:
+        return branch, path
+    path = path or scene.get(FOLDER_KEY)
     if path is not None:
         return _shown_from(scene, path), path
     # No branch was used here yet: a file made by `limber scene`, or appended branches.
@@ -200,15 +203,14 @@ def _current(scene: bpy.types.Scene) -> tuple[bpy.types.Collection | None, str]:
     return branch, "" if branch is None else branch[FOLDER_KEY]
 
 
-def _path_of_active(scene: bpy.types.Scene) -> str:
-    """Return the branch folder of the active object, or an empty text."""
+def _of_active(scene: bpy.types.Scene) -> tuple[bpy.types.Collection | None, str]:
+    """Return the branch of the active object, None if it is of none, and its folder, or a scan's.
+    """
     active = layer_of(scene).objects.active
-    if active is None:
-        return ""
     branch = branch_of(active)
     if branch is not None and branch in branches(scene) and surface_of(branch) is not None:
-        return branch[FOLDER_KEY]
-    return active.get(FOLDER_KEY, "") if SCAN_KEY in active else ""
+        return branch, branch[FOLDER_KEY]
+    return None, active.get(FOLDER_KEY, "") if active is not None and SCAN_KEY in active else ""
 
 
 def _shown_from(scene: bpy.types.Scene, path: str) -> bpy.types.Collection | None:

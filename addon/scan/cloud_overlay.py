@@ -63,10 +63,7 @@ def _changed(_scene, depsgraph=None) -> None:
         _batches.clear()
 
 
-def _renewed(*_) -> None:
-    _batches.clear()
-
-
 DRAWN = (_draw, "POST_VIEW")
-HANDLERS = (("depsgraph_update_post", _changed), ("load_post", _renewed), ("undo_post", _renewed))
+HANDLERS = tuple((event, _changed) for event in (
+    "depsgraph_update_post", "undo_post", "redo_post", "load_post"))
 unregister = _batches.clear

@@ -107,11 +107,7 @@ def _changed(_scene, depsgraph=None) -> None:
         _kept.clear()
 
 
-def _renewed(*_) -> None:
-    _kept.clear()
-
-
 DRAWN = (_draw, "POST_VIEW")
-HANDLERS = (("depsgraph_update_post", _changed), ("undo_post", _renewed), ("redo_post", _renewed),
-            ("load_post", _renewed))
+HANDLERS = tuple((event, _changed) for event in (
+    "depsgraph_update_post", "undo_post", "redo_post", "load_post"))
 unregister = _kept.clear

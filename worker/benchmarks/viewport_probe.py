@@ -251,7 +251,7 @@ def _state() -> str:
                     for thing in bpy.context.scene.objects)
     skeleton = part("branch.branches").find_skeleton(bpy.context.scene)
     surface = part("branch.branches").find_surface(bpy.context.scene)
-    radii = [] if skeleton is None else part("bridge.meshes").scalars(
+    radii = [] if skeleton is None else part("bridge.meshes").values_of(
         skeleton.data, "radius").round(6).tolist()
     colour = None if surface is None else surface.data.color_attributes.active_color.name
     return json.dumps([things, radii, colour, list(limber.plan.goal),
