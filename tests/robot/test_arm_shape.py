@@ -35,9 +35,8 @@ def test_tubes_lie_where_the_urdf_of_others_has_them(recorded_data):
     """A UR5's upper arm and forearm have their middles where the URDF says."""
     root = ElementTree.parse(recorded_data / "ur5_urdf" / "ur5.urdf").getroot()
     origins = {joint.get("name"): joint.find("origin") for joint in root.findall("joint")}
-    middles = {link.get("name"): np.array(
-        link.find("inertial/origin").get("xyz").split(), float)
-        for link in root.findall("link") if link.find("inertial/origin") is not None}
+    middles = {link.get("name"): np.array(link.find("inertial/origin").get("xyz").split(), float)
+               for link in root.findall("link") if link.find("inertial/origin") is not None}
     joints = np.random.default_rng(5).uniform(-np.pi, np.pi, 6)
     rods = ARMS["ur5"].rods(joints[None])
     frame = np.eye(4)

@@ -133,6 +133,15 @@ def test_a_path_is_followed_within_a_millimetre(robot):
     assert np.linalg.norm(samples[-1, 1:4] - start[:3]) < 1e-4
 
 
+def test_a_controller_that_sends_a_quarter_of_its_samples_moves_as_fast(stepped):
+    with RobotLink(cell_for(stepped.address)) as link:
+        tared(link)
+        stepped.server.streams[-1]._every = 4
+        path, began = straight(stepped, (0.0, 0.05, 0.0)), stepped.now
+        assert link.follow(path)["event"] == "reached"
+    assert stepped.now - began < path.duration + 0.6
+
+
 def stands_soon(robot) -> None:
     """Within half a second."""
     wait = robot.rest if isinstance(robot, SteppedRobot) else time.sleep

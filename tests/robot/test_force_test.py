@@ -59,12 +59,10 @@ CAUSES = {
     "stiffer": lambda t, p, turn, x: 3.0 * p,
     "broke or came out": lambda t, p, turn, x: p if x < 0.5 * WAY_M else 0.0 * p,
     "slip": lambda t, p, turn, x: p * np.exp(-max(t - 0.7, 0.0)),
-    "another load": lambda t, p, turn, x: p + 9.81 * (
-        turn @ FIRST.T @ [0, 0, 1.0] - [0, 0, 1.0]),
+    "another load": lambda t, p, turn, x: p + 9.81 * (turn @ FIRST.T @ [0, 0, 1.0] - [0, 0, 1.0]),
     "axes are turned": lambda t, p, turn, x: turned(turn, p, 0.9),
     "drifts": lambda t, p, turn, x: p + [0, 1.5 * t, 0],
-    "something else pushes": lambda t, p, turn, x: p + [0, 1.5 * (x > 0.02), 0],
-}
+    "something else pushes": lambda t, p, turn, x: p + [0, 1.5 * (x > 0.02), 0]}
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -158,9 +158,8 @@ def said(robot: SteppedRos) -> list[str]:
     """What Limber said, in its order, without repetitions."""
     words = {"send_action_goal": "goal", "cancel_action_goal": "cancel"}
     signs = {"/limber/stop": {False: "beat", True: "stop"}, "/limber/end": {None: "end"}}
-    told = [words.get(order["op"]) or signs[order["topic"]][order["msg"].get("data")]
-            for _, order in robot.server.heard
-            if order["op"] not in ("advertise", "call_service")]
+    told = [words.get(order["op"]) or signs[order["topic"]][order["msg"].get("data")] for _, order
+            in robot.server.heard if order["op"] not in ("advertise", "call_service")]
     return list(dict.fromkeys(told))
 
 

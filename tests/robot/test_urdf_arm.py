@@ -124,11 +124,10 @@ def urdf(count: int, *, kind: str = "revolute", limit: str = 'velocity="2.0"',
             f'<collision><origin xyz="0 0 0.1"/><geometry>{shape}</geometry></collision>')
         axis = "0 1 0" if number % 2 else "0 0 2"
         links.append(f'<link name="link{number}">{body}</link>')
-        joints.append(
-            f'<joint name="j{number}" type="{kind}"><origin xyz="0 0 0.2"/>'
-            f'<parent link="{f"link{number - 1}" if number else "foot"}"/>'
-            f'<child link="link{number}"/><axis xyz="{axis}"/>'
-            f'<limit lower="-2.9" upper="2.8" {limit}/></joint>')
+        joints.append(f'<joint name="j{number}" type="{kind}"><origin xyz="0 0 0.2"/>'
+                      f'<parent link="{f"link{number - 1}" if number else "foot"}"/>'
+                      f'<child link="link{number}"/><axis xyz="{axis}"/>'
+                      f'<limit lower="-2.9" upper="2.8" {limit}/></joint>')
     joints.append(f'<joint name="end" type="fixed"><origin xyz="0 0 0.1"/>'
                   f'<parent link="link{count - 1}"/><child link="{end}"/></joint>')
     return f'<robot name="r">{"".join(links)}<link name="{end}"/>{"".join(joints)}</robot>'
@@ -148,9 +147,8 @@ def test_seven_joints_are_planned_with(seven):
     assert path.joints.shape == (len(frames), 7) and path.limit_margin > 0.05
     assert np.abs(seven.forward(path.joints) - frames).max() < 1e-9
     assert np.abs(np.diff(path.joints, axis=0)).max() < 0.1
-    slopes = np.column_stack([
-        (seven.forward(joints + 1e-6 * unit) - seven.forward(joints))[:3, 3] / 1e-6
-        for unit in np.eye(7)])
+    slopes = np.column_stack([(seven.forward(joints + 1e-6 * unit) - seven.forward(joints))[:3, 3] /
+                              1e-6 for unit in np.eye(7)])
     assert seven.jacobian(joints)[:3] == pytest.approx(slopes, abs=1e-5)
 
 

@@ -142,10 +142,9 @@ def test_motion_goes_on_and_comes_to_rest(session):
 @pytest.mark.slow
 def test_a_strange_client_needs_no_limber(branch_folder):
     """A program that knows only JSON and the file's layout gets positions; leaving ends it all."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "limber.session.worker", str(branch_folder), "--settings",
-         '{"reduced": false}'],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-m", "limber.session.worker", str(branch_folder),
+                                "--settings", '{"reduced": false}'], stdin=subprocess.PIPE,
+                               stdout=subprocess.PIPE, text=True)
     hello = next(event for event in map(json.loads, process.stdout) if event["event"] == "hello")
     process.stdin.write(json.dumps({"command": "move", "id": 1, "pose": hello["rest_pose"]}) + "\n")
     process.stdin.flush()

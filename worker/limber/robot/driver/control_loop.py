@@ -100,13 +100,15 @@ class Driver:
             return
         self._hold_ups.note(None if self._last is None else self._last.arrived,
                             moving=self._under_way.following is not None)
+        before = self._last
         if samples:
             self._look(samples)
         elif self._last is not None and not self._bears_silence(self._last):
             return
         self._take(orders)
         if samples and not self.ended:
-            self._move(len(samples) / self._control.rate)
+            # By its clock: a controller may send fewer samples than its rate.
+            self._move(samples[-1].clock - (before or samples[0]).clock)
         self._senses.send_batch()
 
     def _look(self, samples: list[Sample]) -> None:

@@ -533,9 +533,8 @@ class Senses:
             behind = max(following.time - self._lookahead * following.rate, 0.0)
             planned = following.trajectory.pose(behind)
             sent = planned[:3]
-            expected, uncertainty, places = self._expected(
-                following.trajectory, behind, planned, sample.pose
-            )
+            expected, uncertainty, places = self._expected(following.trajectory, behind, planned,
+                                                           sample.pose)
         grasp = self._base @ frame_of(sample.pose)
         decision = self._guard.look(
             sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
