@@ -47,7 +47,7 @@ def run_here(code: str, folder: Path) -> str:
 def test_all_are_run_here():
     assert {path.name for path in SCRIPTS.iterdir()} == {
         "estimate.sh", "render.sh", "bend.py", "night.toml", "scan_to_plan.ipynb", "pull",
-        "ros2"}
+        "ros2", "paper.py"}
 
 
 @pytest.mark.slow
@@ -85,6 +85,25 @@ def test_the_core_in_ten_lines(tmp_path):
     assert 0 < energies[0] < energies[1] < energies[2] and 0 < forces[0] < forces[2]
     text = (SCRIPTS / "bend.py").read_text().split('"""')[2]
     assert len([line for line in text.splitlines() if line.strip()]) <= 10
+
+
+@pytest.mark.campaign
+@pytest.mark.filterwarnings("ignore")
+def test_the_paper_section_by_section(tmp_path):
+    """One of its branches: each modulus in its interval; D-RRT* saves energy, the gentle path more.
+    A second call finds all of it done."""
+    code = (SCRIPTS / "paper.py").read_text(encoding="utf-8")
+    asked = ["paper.py", "out", "--trials", "4", "--branches", "artificial"]
+    with patch.object(sys, "argv", asked):
+        told = run_here(code, tmp_path)
+        assert run_here(code, tmp_path) == told
+    row, = re.findall(r"^artificial +(.+\))$", told, re.MULTILINE)
+    each = re.findall(r"(\S+) \((\S+) to (\S+); (\S+)\)", row)
+    assert len(each) == 4
+    assert all(float(low) < float(true) < float(high) for _, low, high, true in each)
+    saved, gentle = re.search(r"([\d.]+) %  \(gentle path: \S+ %, ([\d.]+) %\)", told).groups()
+    assert 0 < float(saved) < float(gentle)
+    assert (tmp_path / "out" / "paper.png").read_bytes().startswith(b"\x89PNG")
 
 
 def notebook_code() -> list[str]:
