@@ -27,6 +27,7 @@ from limber.core.progress import SILENT
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.operator_decisions import _force_left, retreat_if_chosen
+from limber.robot.virtual.server import RtdeClient
 
 pytest.importorskip("rtde_control")
 
@@ -133,10 +134,15 @@ def test_a_path_is_followed_within_a_millimetre(robot):
     assert np.linalg.norm(samples[-1, 1:4] - start[:3]) < 1e-4
 
 
-def test_a_controller_that_sends_a_quarter_of_its_samples_moves_as_fast(stepped):
+def test_a_controller_that_sends_a_quarter_of_its_samples_moves_as_fast(stepped, monkeypatch):
+    """And that is told once, when it is opened."""
+    usual = RtdeClient.is_due
+    monkeypatch.setattr(RtdeClient, "is_due", lambda client, controller: (
+        controller.step_count % 4 == 0 and usual(client, controller)))
     with RobotLink(cell_for(stepped.address)) as link:
-        tared(link)
-        stepped.server.streams[-1]._every = 4
+        assert ["125 samples a second, 500" in text for text in link.warnings] == [True]
+        link.wait_for_samples()
+        link.tare()
         path, began = straight(stepped, (0.0, 0.05, 0.0)), stepped.now
         assert link.follow(path)["event"] == "reached"
     assert stepped.now - began < path.duration + 0.6

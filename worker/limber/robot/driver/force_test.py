@@ -219,7 +219,7 @@ class ForceTest:
                       for sums in (products, squares))
         since = _log_ratios(since, own, _MEANS_SINCE, _SIGMAS_SINCE)
         ratios = np.r_[_log_ratios(products[_COLUMNS], squares[_COLUMNS], _MEANS, _SIGMAS),
-                       self._turned(products[_TURNS]), since.max(axis=0, initial=-np.inf)]
+                       self.turned(), since.max(axis=0, initial=-np.inf)]
         if (best := float(ratios.max())) <= least:
             return None
         names = [_NAMES[row] for row in np.argsort(-ratios) if ratios[row] > best - _ALIKE_NATS]
@@ -228,11 +228,17 @@ class ForceTest:
                 f"{length(last.off + last.predicted):.2g} N, predicted were "
                 f"{length(last.predicted):.2g} N")
 
-    def _turned(self, products: np.ndarray) -> float:
-        """As :func:`_log_ratios`, of a sensor turned about any axis."""
-        whole = np.eye(3) / _TURN_RAD**2 + self._turns
-        return float(0.5 * products @ np.linalg.solve(whole, products)
-                     - 0.5 * np.log(np.linalg.det(_TURN_RAD**2 * whole)))
+    def turned(self, exact: "ForceTest | None" = None) -> float:
+        """As :func:`_log_ratios`, of a sensor turned about any axis; beside an ``exact`` test of
+        the same blocks what it is at least, as in :meth:`promises`, where blocks are off by what
+        such a sensor tells and by no error."""
+        products = self._sums[1][_TURNS]
+        whole, sure = (np.eye(3) / _TURN_RAD**2 + test._turns for test in (self, exact or self))
+        square = float(products @ np.linalg.solve(whole, products))
+        if exact is not None:
+            spread = np.sqrt(1.0 + products @ np.linalg.solve(sure, products) / max(square, 1e-300))
+            square = max(np.sqrt(square) - _CERTAINTY * spread, 0.0)**2
+        return float(0.5 * square - 0.5 * np.log(np.linalg.det(_TURN_RAD**2 * whole)))
 
     def promises(self, exact: "ForceTest", column: int, factor: float, left: float) -> bool:
         """Return whether a signal with that factor of a column raises an alarm by now, with more
@@ -242,8 +248,7 @@ class ForceTest:
         spread = np.sqrt(left**2 * square + square**2 / max(sure, 1e-300))
         product = np.sign(factor) * max(abs(factor) * square - _CERTAINTY * spread, 0.0)
         return any(at == column and float(_log_ratios(product, square, mean, sigma)) > _ALARM
-                   for _, at, mean, sigma in (*_FROM_START, *_SINCE, *(
-                       ("", turn, 0.0, _TURN_RAD) for turn in _TURNS)))
+                   for _, at, mean, sigma in (*_FROM_START, *_SINCE))
 
 
 _NAMES = [row[0] for row in (*_FROM_START, ("the sensor's axes are turned",), *_SINCE)]
@@ -288,7 +293,8 @@ def _parts(covariance: np.ndarray, predicted: np.ndarray) -> tuple[np.ndarray, n
 
 
 _WHOLE, _HALF = "from the start", "from half way"
-# Columns, the signal's factor, and the share of the predicted force that is left.
+# Columns, the signal's factor, and the share of the predicted force that is left; without a column
+# the angle by which the sensor is turned about its own axis.
 _FAULTS: tuple[tuple[str, str, tuple[int, ...], float, float], ...] = (
     ("empty gripper", _WHOLE, (_SCALE,), -1.0, 0.0),
     ("branch breaks", _HALF, (_LOST,), 1.0, 0.0),
@@ -298,8 +304,8 @@ _FAULTS: tuple[tuple[str, str, tuple[int, ...], float, float], ...] = (
     ("branch three times stiffer", _WHOLE, (_SCALE,), 2.0, 3.0),
     ("sensor reads a tenth", _WHOLE, (_SCALE,), -0.9, 0.1),
     ("sensor's sign", _WHOLE, (_SCALE,), -2.0, 1.0),
-    ("sensor's axes turned by 45 degrees", _WHOLE, (5,), 0.7, 1.0),
-    ("sensor's axes turned by 20 degrees", _WHOLE, (5,), 0.34, 1.0),
+    *((f"sensor's axes turned by {angle} degrees", _WHOLE, (), float(np.radians(angle)), 1.0)
+      for angle in (45, 20)),
     *((f"another {mass:g} kg in the gripper", _WHOLE, (_LOAD,), mass, 1.0)
       for mass in (0.1, 0.3, 1.0)),
     ("sensor drifts by 0.5 N/s", _WHOLE, _DRIFTS, 0.5, 1.0))
@@ -311,6 +317,9 @@ def noticed(path: "Trajectory", errors: ForceErrors, base_turn: np.ndarray) -> l
     None if it does not;
     ``base_turn``: the base's rotation in the branch's frame, shape [3, 3]."""
     test, exact = ForceTest(errors), ForceTest(errors, gain=0.0, unknown=0.0)
+    # By so much the force is off: in the size of a turn's signal a large turn is not linear.
+    turned = {name: (ForceTest(errors), frame_of(np.r_[np.zeros(5), angle])[:3, :3] - np.eye(3))
+              for name, _, columns, angle, _ in _FAULTS if not columns}
     after: dict[str, float] = {}
     blocks = list(_blocks(path, base_turn))
     whole = sum(block.travel for block in blocks)
@@ -322,10 +331,14 @@ def noticed(path: "Trajectory", errors: ForceErrors, base_turn: np.ndarray) -> l
         test.take(block, onset=begins)
         exact.take(replace(block, covariance=np.zeros((3, 3)), places=np.zeros((3, 6))),
                    onset=begins)
+        for own, off in turned.values():
+            own.take(replace(block, off=block.turn @ off @ block.turn.T @ block.predicted),
+                     onset=begins)
         for name, where, columns, factor, left in _FAULTS:
             since = half if where is _HALF else 0.0
-            if name not in after and since is not None and all(
-                    test.promises(exact, column, factor, left) for column in columns):
+            if name not in after and since is not None and (
+                    turned[name][0].turned(exact) > _ALARM if not columns else
+                    all(test.promises(exact, column, factor, left) for column in columns)):
                 # What begins on the way is compared from the next place that is looked from, and
                 # the arm stops a block later.
                 after[name] = (travel - since + float(2.0 * length(block.speed) * BLOCK_SECONDS)

@@ -48,8 +48,7 @@ def cell_urdf(cell: Cell) -> str:
             _shape(link, np.eye(4), "box", size=_numbers(entry.size_m))
             _fixed(root, "branch", name, matrices(np.array(entry.pose)))
         else:
-            _shape(link, np.eye(4), "mesh", filename=entry.file,
-                   scale=_numbers((entry.scale,) * 3))
+            _shape(link, np.eye(4), "mesh", filename=entry.file, scale=_numbers((entry.scale,) * 3))
             _fixed(root, "branch", name, np.eye(4))
     return _text(root)
 

@@ -40,6 +40,9 @@ class SafetyMode(IntEnum):
     ROBOT_EMERGENCY_STOP = 7
 
 
+_SAFETY_BITS = dict(zip(SafetyMode, (0x1, 0x2, 0x404, 0x410, 0x4C0), strict=True))
+
+
 class RuntimeState(IntEnum):
     """As in RTDE's ``runtime_state``."""
 
@@ -563,11 +566,6 @@ class Controller:
         """Return every RTDE output by name."""
         moving = self.motion is not None and not self.motion.finished
         scaling = self.slider if moving else 1.0
-        protective = self.safety_mode == SafetyMode.PROTECTIVE_STOP
-        emergency = self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP
-        normal = self.safety_mode == SafetyMode.NORMAL
-        reduced = self.safety_mode == SafetyMode.REDUCED
-        safeguard = self.safety_mode == SafetyMode.SAFEGUARD_STOP
         values: dict[str, Any] = dict(_STEADY)
         values.update(
             timestamp=self.clock, target_q=self.joints,
@@ -582,8 +580,7 @@ class Controller:
             safety_status=int(self.safety_mode), runtime_state=int(self.runtime_state),
             robot_status_bits=int(self.robot_mode == RobotMode.RUNNING)
             | (self.runtime_state == RuntimeState.PLAYING) << 1,
-            safety_status_bits=int(normal) | reduced << 1 | protective << 2 | safeguard << 4
-            | emergency << 6 | emergency << 7 | (not normal and not reduced) << 10,
+            safety_status_bits=_SAFETY_BITS[self.safety_mode],
             actual_digital_output_bits=self.digital_outputs,
             payload=self.payload, payload_cog=self.payload_centre, tcp_offset=self.tool_offset)
         values.update(zip(_INT_NAMES, self.outputs_int, strict=True))

@@ -179,37 +179,31 @@ def _set_force(server: Server, wrench: Sequence[float]) -> None:
     server.controller.fault.added = np.asarray(wrench, float).reshape(6)
 
 
-def _set(target: str, name: str) -> Callable:
+def _set(name: str) -> Callable:
     def action(server: Server, value: Any = True) -> None:
-        setattr({"server": server, "controller": server.controller,
-                 "fault": server.controller.fault}[target], name, value)
+        places = (server, server.controller, server.controller.fault)
+        setattr(next(each for each in places if hasattr(each, name)), name, value)
     return action
 
 
+def _do(name: str) -> Callable:
+    return lambda server, **values: getattr(server.controller, name)(**values)
+
+
 ACTIONS: dict[str, Callable[..., Any]] = {
+    **{name: _set(name) for name in (
+        "silent", "delay", "ft300_fault", "slider", "payload", "joints_nan")},
+    **{name: _do(name) for name in ("safeguard_stop", "power_off", "emergency_stop", "unlock",
+                                    "reset_emergency", "stand")},
     "state": lambda server: None,
     "cut": lambda server: server.cut(),
-    "silent": _set("server", "silent"),
-    "delay": _set("server", "delay"),
-    "frozen_sensor": _set("fault", "frozen"),
-    "sensor_nan": _set("fault", "nan"),
+    "frozen_sensor": _set("frozen"), "sensor_nan": _set("nan"),
     "added_wrench": _set_force,
-    "clock_jump": _set("controller", "clock_offset"),
-    "slider": _set("controller", "slider"),
-    "outputs": _set("controller", "digital_outputs"),
-    "payload": _set("controller", "payload"),
-    "tool": lambda server, offset: server.controller.set_tool(offset),
-    "joints_nan": _set("fault", "joints_nan"),
+    "clock_jump": _set("clock_offset"), "outputs": _set("digital_outputs"),
+    "tool": _do("set_tool"),
     "clock_stands": lambda server, value=True: server.controller.hold_clock(bool(value)),
-    "ft300_fault": _set("server", "ft300_fault"),
-    "pause": lambda server: server.controller.pause_program(),
-    "safeguard_stop": lambda server: server.controller.safeguard_stop(),
-    "reduced": lambda server: server.controller.reduce(),
-    "power_off": lambda server: server.controller.power_off(),
+    "pause": _do("pause_program"), "reduced": _do("reduce"), "home": _do("stand"),
     "protective_stop": lambda server: server.controller.protective_stop("test"),
-    "unlock": lambda server: server.controller.unlock(),
-    "emergency_stop": lambda server: server.controller.emergency_stop(),
-    "reset_emergency": lambda server: server.controller.reset_emergency(),
     "local": lambda server: server.controller.set_remote(False),
     "remote": lambda server: server.controller.set_remote(True),
     "grasp": lambda server: server.controller.load.grasp(),
@@ -217,7 +211,5 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "break": lambda server: server.controller.load.lose("broken"),
     "slip": lambda server, part: server.controller.load.slide(part),
     "creep": lambda server, part: setattr(server.controller.load, "creep", float(part)),
-    "home": lambda server: server.controller.stand(),
-    "stand": lambda server, joints: server.controller.stand(joints),
     "stop_program": lambda server: server.controller.stop_program("test"),
 }
