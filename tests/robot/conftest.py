@@ -10,11 +10,11 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import psutil
 import pytest
-from tests.robot.stepped_ros import SteppedRos
 
 from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import cell_file, sideways
 from benchmarks.robot_faults import new_robot, restored
+from benchmarks.robot_ros_stepped import HOME, ROS_CELL, SteppedRos
 from benchmarks.robot_rosbridge import RosBridge
 from benchmarks.robot_stepped import SteppedRobot
 from limber.cell.cell_file import Cell
@@ -188,17 +188,13 @@ def stepped():
     yield from _stepped("ur5e")
 
 
-ROS_CELL = Cell(robot={"model": "ur5e", "address": "ws://stepped"}, base={"pose": (0,) * 6},
-                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
-
-
 @pytest.fixture
 def stepped_ros():
     """Make a robot in ROS and a link to it, in the robot's time; ``plan(server, step)`` makes the
     faults, settings are of the server."""
     with ExitStack() as around:
         def made(plan=None, cell: Cell = ROS_CELL, **settings) -> tuple[SteppedRos, RobotLink]:
-            server = RosBridge(np.array(ROS_CELL.arm.home))
+            server = RosBridge(HOME)
             vars(server).update(settings)
             robot = around.enter_context(SteppedRos(
                 server, None if plan is None else lambda step: plan(robot, step)).here())

@@ -4,46 +4,26 @@ import ast
 import base64
 import threading
 import time
-from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from tests.robot.conftest import ROS_CELL
 
+from benchmarks.robot_ros import linked
+from benchmarks.robot_ros_stepped import HOME, TOOL, line, to_and_fro
+from benchmarks.robot_ros_stepped import ROS_CELL as CELL
 from benchmarks.robot_rosbridge import RosBridge
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.joint_path import joint_path
-from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.ros.bridge import Bridge
 from limber.robot.ros.messages import CloudTopic, JointStates, cloud_of, goal_of, spline
 from limber.robot.ros.ros_control import BEAT_SECONDS
 
-CELL = ROS_CELL
 ROOT = Path(__file__).parents[2]
-HOME = np.array(CELL.arm.home)
-TOOL = matrices(np.array(CELL.tool.grasp_pose))
-
-
-def line(way: float, speed: float = 0.05) -> Trajectory:
-    start = pose_vectors(CELL.arm.forward(HOME) @ TOOL)
-    poses = densely(np.array([start, start + [0, way, 0, 0, 0, 0]]))
-    joints = joint_path(CELL.arm, matrices(poses) @ np.linalg.inv(TOOL), start=HOME).joints
-    return Trajectory(along(poses, speed, 0.5), poses, ExpectedWrench.nothing(poses), joints)
-
-
-@contextmanager
-def linked(server: RosBridge, taken: list | None = None):
-    """A link to a robot in ROS, with its driver in a process."""
-    cell = CELL.model_copy(update={"robot": CELL.robot.model_copy(update={"address": server.url})})
-    with RobotLink(cell, None if taken is None else taken.append) as link:
-        link.wait_for_samples()
-        link.tare(0.25)
-        yield link
 
 
 @pytest.mark.real_time
@@ -51,7 +31,7 @@ def linked(server: RosBridge, taken: list | None = None):
 def test_a_plan_is_followed_and_a_force_stops_it_in_time():
     """All samples at 125 Hz; then a push: stop topic and cancel within 0.1 s, and standstill."""
     taken = []
-    with RosBridge(HOME) as server, linked(server, taken) as link:
+    with RosBridge(HOME) as server, linked(server, taken.append) as link:
         path = line(0.02)
         taken.clear()
         assert link.follow(path)["event"] == "reached"
@@ -87,8 +67,7 @@ def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypa
     robot, link = stepped_ros(wrench=np.array([2.0, 0, 0, 0, 0, 0]))
     robot.server.load = lambda joints: np.r_[0, 0, 400.0 * np.linalg.norm(
         CELL.arm.forward(joints)[:3, 3] - start), 0, 0, 0]
-    path = line(0.05)
-    event = link.follow(Trajectory(path.times, path.poses, None, path.joints))
+    event = link.follow(replace(line(0.05), expected=None))
     assert event["event"] == "paused" and "soft force" in event["reason"]
     link.close()
     assert np.abs(robot.server.joints - HOME).max() > 0.01
@@ -171,12 +150,9 @@ def test_a_goal_carries_times_and_ends_at_rest():
 def test_a_long_path_is_a_small_goal_that_the_controllers_spline_stays_on():
     """There and back five times with rests: a tenth of the points, none of them off the path."""
     out = line(0.1, 0.03)
-    legs = [out, out.backwards()] * 5
-    times = np.concatenate([k * (out.duration + 0.5) + leg.times for k, leg in enumerate(legs)])
-    path = Trajectory(times, np.concatenate([leg.poses for leg in legs]), None,
-                      np.concatenate([leg.joints for leg in legs]))
+    path = to_and_fro(out, 0.5, 5)
     points = goal_of(path, ["a"] * 6)["trajectory"]["points"]
-    assert len(points) < 0.2 * len(times)
+    assert len(points) < 0.2 * len(path.times)
     at, joints, speeds = (np.array(column) for column in zip(*((
         point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"],
         point["positions"], point["velocities"]) for point in points), strict=True))
@@ -185,7 +161,7 @@ def test_a_long_path_is_a_small_goal_that_the_controllers_spline_stays_on():
         rows = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, len(at) - 2)
         return np.array([spline(time, at[k:k + 2], joints[k:k + 2], speeds[k:k + 2])
                          for time, k in zip(wanted, rows, strict=True)])
-    assert np.abs(passed(times) - path.joints).max() < 6e-5
+    assert np.abs(passed(path.times) - path.joints).max() < 6e-5
     # While it rests no spline swings.
     rests = passed(np.linspace(out.duration, out.duration + 0.5, 50)) - out.joints[-1]
     assert np.abs(rests).max() < 1e-6

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from tests.robot.stepped_ros import SteppedRos
 from tests.robot.test_execution import cell_before, motion_settings_at
 from tests.robot.test_record import sideways_pull
 from tests.subjects.commands import robot_answer
 
 from benchmarks.robot_cells import cell_file, sideways, standing_at, true_branch
+from benchmarks.robot_ros_stepped import SteppedRos
 from benchmarks.robot_rosbridge import STEP, RosBridge
 from benchmarks.robot_stepped import BranchHere
 from limber.cell.cell_file import Cell

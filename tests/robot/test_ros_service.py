@@ -6,10 +6,10 @@ from collections import deque
 
 import numpy as np
 import pytest
-from tests.robot.stepped_ros import SteppedRos
 from tests.robot.test_ros import CELL, HOME, line, linked
 from tests.subjects.commands import answer
 
+from benchmarks.robot_ros_stepped import SteppedRos
 from benchmarks.robot_rosbridge import STEP, RosBridge
 from limber.cell.cell_file import write_cell
 from limber.robot.driver.link import RobotLink

@@ -153,8 +153,7 @@ def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0,
     times = np.linspace(0.0, 6.0, FRAMES)
     poses, wrenches, positions = (CubicSpline(states, values)(times)
                                   for values in (made.poses, made.wrenches, seen))
-    return Pull(f"pull-{number + 1}", entry, times, poses, wrenches,
-                Observations(times, positions))
+    return Pull(f"pull-{number + 1}", entry, times, poses, wrenches, Observations(times, positions))
 
 
 def recorded(pull: Pull, cell: CellErrors, rng: np.random.Generator) -> Pull:

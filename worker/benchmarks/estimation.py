@@ -310,10 +310,8 @@ def _ringing(seed: int) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {"covered": [], "errors": [], "frequencies": []}
     for _ in range(_EACH):
         true = float(_YOUNG * np.exp(rng.normal(0, 0.5)))
-        real = replace(skeleton, radius=skeleton.radius * np.exp(
-            RADIUS_SIGMA * rng.normal()))
-        branch = _model(real, _FINER, true,
-                        _DENSITY * float(np.exp(DENSITY_SIGMA * rng.normal())))
+        real = replace(skeleton, radius=skeleton.radius * np.exp(RADIUS_SIGMA * rng.normal()))
+        branch = _model(real, _FINER, true, _DENSITY * float(np.exp(DENSITY_SIGMA * rng.normal())))
         modes = lowest_modes(branch, 3)
         node = int(np.linalg.norm(branch.mesh.nodes
                                   - skeleton.nodes[skeleton.main_path()[-1]], axis=1).argmin())
@@ -322,8 +320,7 @@ def _ringing(seed: int) -> dict[str, list[float]]:
         away = float(np.log(told["young_factor"] * _YOUNG / true))
         found["covered"].append(float(abs(away) < 1.96 * told["deviation"]))
         found["errors"].append(abs(away))
-        found["frequencies"].append(float(abs(
-            seen.frequencies[0] / modes.frequencies[0] - 1)))
+        found["frequencies"].append(float(abs(seen.frequencies[0] / modes.frequencies[0] - 1)))
     return found
 
 

@@ -138,8 +138,7 @@ class Voided:
             try:
                 return run()
             except FAILURES as error:
-                longest = self._witness.longest(
-                    max(began, time.monotonic() - _MEANWHILE_SECONDS))
+                longest = self._witness.longest(max(began, time.monotonic() - _MEANWHILE_SECONDS))
                 if longest < HELD_UP_SECONDS:
                     raise
                 self.count += 1

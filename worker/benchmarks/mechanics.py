@@ -386,8 +386,7 @@ def memory_row(setting: Setting) -> list[Row]:
     count = setting.at_most(50_000, 10_000)
     with Pool(1) as pool:
         found, megabytes, seconds, converged = pool.submit(_solve_large, count).result()
-    is_met = None if setting.quick else bool(
-        converged and megabytes < 4096 and found >= 45_000)
+    is_met = None if setting.quick else bool(converged and megabytes < 4096 and found >= 45_000)
     return [Row(*_MEMORY, f"{megabytes / 1024:.2f} GB at {found} tetrahedra,"
                 f" {'solved' if converged else 'not solved'} in {seconds:.0f} s", is_met)]
 

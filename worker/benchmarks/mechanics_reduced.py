@@ -284,8 +284,7 @@ def _held_at(model: ReducedModel, path: "scipy.interpolate.CubicSpline", instant
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Grasp coordinates, velocity and acceleration on a path, by central differences."""
     small = 2e-5
-    before, now, after = (model.held.at(path(instant + shift))
-                          for shift in (-small, 0.0, small))
+    before, now, after = (model.held.at(path(instant + shift)) for shift in (-small, 0.0, small))
     return now, (after - before) / (2 * small), (before - 2 * now + after) / small**2
 
 

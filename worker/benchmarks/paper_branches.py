@@ -92,8 +92,7 @@ class PaperBranch:
         skeleton = self.skeleton
         if self.fork is not None:
             return mesh_skeleton(skeleton, ReconstructSettings()).mesh
-        mesh = curved_beam(skeleton.nodes, skeleton.radius, slice_length=slice_length,
-                           sides=sides)
+        mesh = curved_beam(skeleton.nodes, skeleton.radius, slice_length=slice_length, sides=sides)
         return mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
 
     def truth(self) -> TrueBranch:

@@ -448,8 +448,7 @@ def _bare_row(trials: list[Trial]) -> list[Row]:
     bare = [run for run in trials if _REAL[run.task[0]].bare]
     each = [_why(run) if run.failure else
             f"{run.task[0]} {run['called_leaf']:.1%} / {run['flying']:.1%}" for run in bare]
-    good = all(not run.failure and max(run["called_leaf"], run["flying"]) < _CALLED
-               for run in bare)
+    good = all(not run.failure and max(run["called_leaf"], run["flying"]) < _CALLED for run in bare)
     return [Row(*BARE, "; ".join(each), good, len(bare))] if bare else []
 
 

@@ -36,6 +36,7 @@ from benchmarks.robot_faults import (
 )
 from benchmarks.robot_guard import GUARD_ROWS, guarded_paths
 from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
+from benchmarks.robot_ros_faults import ROS_FAULT_ROWS, ros_faults
 from benchmarks.robot_stops import RETREAT_ROW, STATES_ROW, retreats, wrong_states
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.trials import Trial, column, sound
@@ -214,6 +215,7 @@ PARTS = {
     "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
     "calibration": Part(calibrations, 30, CALIBRATION_ROWS, grows=True),
     "ros": Part(_watched(ros_door), LEAST_ROS_S, ROS_ROWS, grows=True),
+    "ros-faults": Part(ros_faults, 60, ROS_FAULT_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
                      grows=True),
     "guard": Part(guarded_paths, 300, GUARD_ROWS, grows=True),

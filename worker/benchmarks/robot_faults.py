@@ -51,7 +51,20 @@ def _asked(action: str, **values: object) -> Fault:
     return lambda robot, link: robot.ask(action, **values) and None
 
 
-FAULTS: dict[str, tuple[str, Fault]] = {
+def _slow_push(robot: VirtualRobot, link: RobotLink) -> None:
+    """A force that grows by 5 N a second, as of something that is pushed along."""
+    for force in np.arange(0.0, 8.0, 0.1):
+        robot.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
+        time.sleep(0.02)
+
+
+def _button_and_back(robot: VirtualRobot, link: RobotLink) -> None:
+    """An emergency stop that is reset before anybody can have looked."""
+    robot.ask("emergency_stop")
+    robot.ask("reset_emergency")
+
+
+EVERY: dict[str, tuple[str, Fault]] = {
     "connection cut": ("lost|closed|no data", _asked("cut")),
     "controller killed": ("lost|closed|no data", lambda robot, link: robot.kill()),
     "protective stop": ("protective stop", _asked("protective_stop")),
@@ -71,25 +84,6 @@ FAULTS: dict[str, tuple[str, Fault]] = {
         "no data|program", lambda robot, link: os.kill(link.process.pid, signal.SIGSTOP)),
     "two clients": ("program", lambda robot, link: _another_program(robot.address)),
     "drift of 4 N": ("force", _asked("added_wrench", wrench=[0, 0, 4.2, 0, 0, 0])),
-}
-"""The faults of a first robot, each with what the report must contain, as a regular expression; the
-tests provoke each."""
-
-
-def _slow_push(robot: VirtualRobot, link: RobotLink) -> None:
-    """A force that grows by 5 N a second, as of something that is pushed along."""
-    for force in np.arange(0.0, 8.0, 0.1):
-        robot.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
-        time.sleep(0.02)
-
-
-def _button_and_back(robot: VirtualRobot, link: RobotLink) -> None:
-    """An emergency stop that is reset before anybody can have looked."""
-    robot.ask("emergency_stop")
-    robot.ask("reset_emergency")
-
-
-MORE_FAULTS: dict[str, tuple[str, Fault]] = {
     "slider at 0": ("scales the speed to 0", _asked("slider", value=0.0)),
     "slider at a fifth": ("speed slider", _asked("slider", value=0.2)),
     "paused on the pendant": ("program", _asked("pause")),
@@ -116,8 +110,7 @@ MORE_FAULTS: dict[str, tuple[str, Fault]] = {
     "FT300 force spike": ("force", _asked("added_wrench", wrench=[0, 0, 40, 0, 0, 0])),
     "FT300 frozen": ("frozen", _asked("frozen_sensor")),
 }
-"""Further ones, for the bench; in the tests they are slow."""
-EVERY = FAULTS | MORE_FAULTS
+"""Each with what the report must contain, as a regular expression."""
 ENDS_ROBOT = ("controller killed",)
 _DIRECTIONS: dict[str, Direction] = {
     "cable carries nothing to the robot": "to the robot",

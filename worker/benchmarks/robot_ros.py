@@ -13,22 +13,17 @@ from unittest.mock import patch
 import numpy as np
 
 from benchmarks.machine_stalls import Voided
+from benchmarks.robot_ros_stepped import HOME, ROS_CELL, line, to_and_fro
 from benchmarks.robot_rosbridge import STEP, RosBridge
 from benchmarks.table import Asked, Row, Setting
-from limber.cell.cell_file import Cell
-from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.robot.driver.link import RobotLink
 from limber.robot.driver.real_time import claim_real_time, keep_awake
-from limber.robot.motion.joint_path import joint_path
-from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
+from limber.robot.motion.trajectory import Trajectory
 
 LEAST_ROS_S = 30.0
 _ASKED_S, _STOP_S, _STOPS, _AROUND_S = 600.0, 0.1, 5, 25.0
 ROS_ROWS = (Asked("a path through rosbridge at 125 Hz for 600 s, wrench in: samples lost", "0"),
             Asked("stop published in ROS until the arm stands, worst", "100 ms"))
-_CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
-             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
-_HOME = np.array(_CELL.arm.home)
 
 
 def ros_door(setting: Setting, voided: Voided) -> list[Row]:
@@ -54,9 +49,9 @@ def ros_door(setting: Setting, voided: Voided) -> list[Row]:
 def _lost(seconds: float) -> tuple[int, int]:
     """Samples between the first and the last of a path that the guard did not see; and all."""
     rows: list[np.ndarray] = []
-    with RosBridge(_HOME) as server:
+    with RosBridge(HOME) as server:
         server.sent = deque(maxlen=0)
-        with _linked(server, rows.append) as link:
+        with linked(server, rows.append) as link:
             event = link.follow(_path(seconds))
     assert event["event"] == "reached", event["reason"]
     steps = np.round(np.diff(np.concatenate(rows)[:, 0]) / STEP).astype(int)
@@ -65,7 +60,7 @@ def _lost(seconds: float) -> tuple[int, int]:
 
 def _stopped() -> float:
     """Time from a stop on the topic until the arm stands [s]."""
-    with RosBridge(_HOME) as server, _linked(server) as link:
+    with RosBridge(HOME) as server, linked(server) as link:
         published: list[float] = []
 
         def publish() -> None:
@@ -79,10 +74,10 @@ def _stopped() -> float:
 
 
 @contextmanager
-def _linked(server: RosBridge, taken: Callable[[np.ndarray], None] | None = None,
+def linked(server: RosBridge, taken: Callable[[np.ndarray], None] | None = None,
             ) -> Iterator[RobotLink]:
     """A tared link to the server's robot."""
-    cell = _CELL.model_copy(update={"robot": _CELL.robot.model_copy(
+    cell = ROS_CELL.model_copy(update={"robot": ROS_CELL.robot.model_copy(
         update={"address": server.url})})
     with RobotLink(cell, taken) as link:
         link.wait_for_samples()
@@ -92,15 +87,5 @@ def _linked(server: RosBridge, taken: Callable[[np.ndarray], None] | None = None
 
 def _path(seconds: float) -> Trajectory:
     """A line to and fro at 30 mm/s, for about ``seconds`` [s]."""
-    tool = matrices(np.array(_CELL.tool.grasp_pose))
-    start = pose_vectors(_CELL.arm.forward(_HOME) @ tool)
-    out = densely(np.array([start, start + [0, 0.1, 0, 0, 0, 0]]))
-    joints = joint_path(_CELL.arm, matrices(out) @ inverted(tool), start=_HOME).joints
-    leg = along(out, 0.03, 0.3)
-    there = Trajectory(leg, out, None, joints)
-    legs = [there, there.backwards()] * max(1, round(0.5 * seconds / leg[-1]))
-    poses = np.concatenate([each.poses for each in legs])
-    return Trajectory(np.concatenate([number * (leg[-1] + 0.02) + each.times
-                                      for number, each in enumerate(legs)]),
-                      poses, ExpectedWrench.nothing(poses), np.tile(
-                          np.concatenate([joints, joints[::-1]]), (len(legs) // 2, 1)))
+    leg = line(0.1, 0.03)
+    return to_and_fro(leg, 0.02, max(1, round(0.5 * seconds / leg.duration)))

@@ -128,8 +128,7 @@ def _depth_image(hits: Hits, rng: np.random.Generator) -> np.ndarray:
 
 
 def _case(branch: GeneratedBranch, name: str) -> ScanCase:
-    return ScanCase(name, branch.seed, branch.skeleton, branch.cloud.points,
-                    branch.surface.volume)
+    return ScanCase(name, branch.seed, branch.skeleton, branch.cloud.points, branch.surface.volume)
 
 
 def leafy_case(seed: int) -> ScanCase:

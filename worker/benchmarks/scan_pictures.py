@@ -20,8 +20,7 @@ def draw(path: Path, points: np.ndarray, found: Skeleton, title: str,
     from matplotlib.collections import LineCollection
 
     middle = points.mean(axis=0)
-    sides = np.linalg.svd(points[::max(len(points) // 20_000, 1)] - middle,
-                          full_matrices=False)[2]
+    sides = np.linalg.svd(points[::max(len(points) // 20_000, 1)] - middle, full_matrices=False)[2]
     figure, axes = plt.subplots(1, 2, figsize=(14, 10), constrained_layout=True)
     for axis, chosen in zip(axes, ([1, 0], [2, 0]), strict=True):
         def flat(places: np.ndarray, chosen: list[int] = chosen) -> np.ndarray:

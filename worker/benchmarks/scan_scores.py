@@ -93,8 +93,7 @@ def outcomes(setting: Setting, counts: dict[str, int]) -> dict[str, Outcomes]:
         "cases", [(kind, seed) for seed in seeds for kind, count in counts.items()
                   if seed < seeds.start + count],
         partial(scored_case, out=setting.out), "geometry", workers=None, catch=Exception)
-    return {kind: Outcomes([trial for trial in trials if trial.task[0] == kind])
-            for kind in counts}
+    return {kind: Outcomes([trial for trial in trials if trial.task[0] == kind]) for kind in counts}
 
 
 def scored_case(task: tuple[str, int], out: Path | None) -> dict[str, Any]:

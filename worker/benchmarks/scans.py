@@ -68,8 +68,7 @@ def _probability_row(asked: Asked, bins: np.ndarray, cases: int) -> Row:
         good &= bool(off <= _ALLOWED + slack)
         texts.append(f"{low / 10:.1f}: said {100 * said:.0f}, were {100 * was:.0f} "
                      f"(+-{100 * slack:.0f}) of {members:.0f}")
-    return Row(*asked, f"worst {100 * worst:.0f}; " + "; ".join(texts), good and bool(texts),
-               cases)
+    return Row(*asked, f"worst {100 * worst:.0f}; " + "; ".join(texts), good and bool(texts), cases)
 
 
 # --- own generator ------------------------------------------------------------------------------
@@ -255,8 +254,7 @@ def dropped_rows(bare: list[Outcomes]) -> list[Row]:
     one = _together(bare)
     if not one.count:
         return []
-    leaf, gone = (one.column(key) if one.scores else np.zeros(1) for key in (
-        "called_leaf", "gone"))
+    leaf, gone = (one.column(key) if one.scores else np.zeros(1) for key in ("called_leaf", "gone"))
     lost = int(one.column("twigs_lost").sum()) if one.scores else 0
     return [Row(*DROPPED, f"mean {leaf.mean():.1%}, worst {leaf.max():.0%} / mean {gone.mean():.1%}"
                 f", worst {gone.max():.0%}; {lost}; {len(one.failed)}{one.told(2)}",

@@ -197,8 +197,7 @@ def _processor_seconds() -> float:
 
 # --- rows -------------------------------------------------------------------------------------
 
-GROUPS = {f"{NEW} (no fit, but looked at)": (NEW,), "the six sources of the worlds": tuple(
-    SOURCES)}
+GROUPS = {f"{NEW} (no fit, but looked at)": (NEW,), "the six sources of the worlds": tuple(SOURCES)}
 
 
 def _axes_asked(name: str, near: float) -> Asked:

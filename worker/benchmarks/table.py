@@ -23,8 +23,7 @@ from limber.core.errors import Cancelled
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, BarSink, Progress
 
-NAMES = ("mechanics", "estimation", "truth", "planning", "robot", "scans", "viewport",
-         "worker")
+NAMES = ("mechanics", "estimation", "truth", "planning", "robot", "scans", "viewport", "worker")
 NOT_SHOWN = "not shown"
 """Entry of a row without time, or without anything to measure it with."""
 _FEW = 20

@@ -54,8 +54,7 @@ _THREE_PULLS = _asked("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees
 _START = Asked("truths of 0.3 MPa to 10 GPa that fall 1 to 30 fold, at 1 to 4 control points, "
                   "half of them with a fork: fits that end at them (loss within 1 %)",
                "198 of 200")
-_ADVICE = Asked("interval expected after an action over that got by following it",
-                "within 20 %")
+_ADVICE = Asked("interval expected after an action over that got by following it", "within 20 %")
 _SETTINGS = FitSpec(hold_out=False, mesh_check=False)
 _PLAIN = _SETTINGS.model_copy(update={"field": "inverse_distance", "poisson": 0.35,
                                      "poisson_sigma": 0.0})

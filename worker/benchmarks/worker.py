@@ -225,8 +225,7 @@ def _size_asked(count: int) -> Asked:
 
 SMALL_ROW = Asked("branches of 60 to 250 points, bare and one-sided: neither a result nor a reason",
                   "0")
-PIECES_ROW = Asked(f"{_PIECES:,} pieces without order: processor time",
-                   f"{_PIECES_SECONDS:.0f} s")
+PIECES_ROW = Asked(f"{_PIECES:,} pieces without order: processor time", f"{_PIECES_SECONDS:.0f} s")
 LARGE_ROWS = (SMALL_ROW, *map(_size_asked, _LIMITS), PIECES_ROW)
 
 

@@ -44,8 +44,7 @@ def memory(setting: Setting) -> list[Row]:
                 return [Row(*MEMORY_ROW, record.error, False, number)]
             used.append(record.memory_mb)
     grown = float(np.median(used[-5:]) / np.median(used[9:14]) - 1)
-    return [Row(*MEMORY_ROW, f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05,
-                len(used))]
+    return [Row(*MEMORY_ROW, f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05, len(used))]
 
 
 def make_scans(folder: Path, count: int, seed: int) -> None:

@@ -66,8 +66,7 @@ def entry(content: bytes, stage: str = "estimate") -> dict[str, Any]:
 
 
 def _drawn(choices: tuple[str, ...], folder: Path, rng: np.random.Generator) -> str:
-    return str(choices[int(rng.integers(len(choices)))]).replace("{root}",
-                                                                 str(folder.parents[2]))
+    return str(choices[int(rng.integers(len(choices)))]).replace("{root}", str(folder.parents[2]))
 
 
 def _write(folder: Path, content: Any) -> None:

@@ -7,13 +7,58 @@ from collections import deque
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
+
 from benchmarks import robot_rosbridge
-from benchmarks.robot_rosbridge import STEP
+from benchmarks.robot_rosbridge import STEP, RosBridge
 from benchmarks.robot_stepped import SteppedRobot
+from limber.cell.cell_file import Cell
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
+from limber.robot.motion.joint_path import joint_path
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.ros import ros_control
 from limber.robot.ros.bridge import Bridge
+from limber.robot.ros.topics import Topics
 
 _NODE = Path(__file__).parents[2] / "scripts/examples/ros2/limber_stop/limber_stop/watch.py"
+ROS_CELL = Cell(robot={"model": "ur5e", "address": "ws://stepped"}, base={"pose": (0,) * 6},
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
+HOME, TOOL = np.array(ROS_CELL.arm.home), matrices(np.array(ROS_CELL.tool.grasp_pose))
+
+
+def line(way: float, speed: float = 0.05) -> Trajectory:
+    """A line from home by ``way`` [m], with its joints; no force is expected on it."""
+    start = pose_vectors(ROS_CELL.arm.forward(HOME) @ TOOL)
+    poses = densely(np.array([start, start + [0, way, 0, 0, 0, 0]]))
+    joints = joint_path(ROS_CELL.arm, matrices(poses) @ inverted(TOOL), start=HOME).joints
+    return Trajectory(along(poses, speed, 0.5), poses, ExpectedWrench.nothing(poses), joints)
+
+
+def to_and_fro(out: Trajectory, rest: float, cycles: int = 1) -> Trajectory:
+    """A trajectory and its return, after a ``rest`` [s] each, as often."""
+    legs = [out, out.backwards()] * cycles
+    poses = np.concatenate([each.poses for each in legs])
+    times = [number * (out.duration + rest) + each.times for number, each in enumerate(legs)]
+    return Trajectory(np.concatenate(times), poses, ExpectedWrench.nothing(poses),
+                      np.concatenate([each.joints for each in legs]))
+
+
+class ServoBridge(RosBridge):
+    """MoveIt Servo's end: it moves the joints by the last speeds that came, for 0.1 s."""
+
+    until = 0
+
+    def _hear(self, socket, order):
+        super()._hear(socket, order)
+        if order["op"] == "publish" and order["topic"] == Topics().jog:
+            speeds = dict(zip(order["msg"]["joint_names"], order["msg"]["velocities"], strict=True))
+            self.drift = np.array([speeds[f"{name}_joint"] for name in ROS_CELL.arm.ros_joints])
+            self.until = 0.1 / STEP
+
+    def _step(self, socket):
+        self.until -= 1
+        self.drift = self.drift * (self.until > 0 and not self.sticks)
+        super()._step(socket)
 
 
 class SteppedRos(SteppedRobot):
