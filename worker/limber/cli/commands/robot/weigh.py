@@ -11,6 +11,7 @@ import numpy as np
 
 from limber.cli.cell_tool import ArmedTool, confirmed_by
 from limber.cli.commands.robot.moves import log_move, require_empty, stands
+from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError, SafetyStop
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
@@ -129,7 +130,6 @@ def _reading(cell: Cell, rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray
 # The gripper is tilted a little about two axes. The change of its weight is known from the stated
 # mass; a sensor with another sign, unit or other axes shows another change.
 
-_GRAVITY = 9.81
 _LEAST_TILT = 0.03  # sine of the angle of gravity's change
 _MOST_TILT = 0.5  # rad
 _CHANGE_N = 2.0  # N of the weight; the guard stops at limits.unexpected_force_n, 3 N by default
@@ -153,7 +153,8 @@ class Weighing:
 def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:
     """Return joint angles [6, n] from ``joints`` [n] and back, tilted by the two middle wrists so
     little that the weight of ``mass`` [kg] changes by no more than the guard allows."""
-    tilt = min(_MOST_TILT, float(np.arcsin(min(1.0, _CHANGE_N / max(_GRAVITY * mass, 1e-9)))))
+    weight = max(STANDARD_GRAVITY * mass, 1e-9)
+    tilt = min(_MOST_TILT, float(np.arcsin(min(1.0, _CHANGE_N / weight))))
     offs = np.zeros((6, len(joints)))
     offs[[1, 2], 3] = tilt, -tilt
     offs[[3, 4], 4] = tilt, -tilt
@@ -189,10 +190,10 @@ def compared(downs: np.ndarray, forces: np.ndarray, times: np.ndarray, stated: f
     left = forces - columns @ found
     free = max(left.size - found.size, 1)
     spread = float(np.sqrt((left**2).sum() / free))
-    changes, regressors = found[:2] / _GRAVITY, axes[:2]
+    changes, regressors = found[:2] / STANDARD_GRAVITY, axes[:2]
     along = float((changes * regressors).sum() / 2)
     size = float(np.sqrt((changes**2).sum() / 2))
-    sigma = spread / _GRAVITY / np.sqrt((tilts**2).sum())
+    sigma = spread / STANDARD_GRAVITY / np.sqrt((tilts**2).sum())
     return Weighing(along, sigma, tuple(_faults(along, size, sigma, stated)))
 
 
