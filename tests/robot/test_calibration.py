@@ -18,13 +18,7 @@ from limber.geometry.rigid_kernels import pose_of
 from limber.robot.calibration import fit_base, gripper_pose
 from limber.robot.controller_settings import differences
 from limber.robot.interface import Sample
-from limber.robot.ur.factory_calibration import (
-    PRIMARY_PORT,
-    FactoryCalibration,
-    kinematics_message,
-    one_arm,
-    read_calibration,
-)
+from limber.robot.ur import factory_calibration as factory
 
 GRASP = (0.01, 0.0, 0.15, 0.0, 0.0, 0.3)
 BASE = np.array([0.6, -0.2, 0.1, 0.3, -0.4, 1.2])
@@ -150,13 +144,13 @@ def test_the_command_states_each_points_residual(branch_folder, tmp_path, capfd)
 
 def test_the_arms_own_dimensions_are_read_from_its_controller(own_address):
     """In a thread: bytes as a controller sends them, between others and cut anywhere."""
-    arm = one_arm(ARMS["ur5e"], 0.004, np.random.default_rng(3))
-    sent = FactoryCalibration.of(arm)
+    arm = factory.one_arm(ARMS["ur5e"], 0.004, np.random.default_rng(3))
+    sent = factory.FactoryCalibration.of(arm)
     other = struct.pack(">iB", 12, 0) + bytes(7)
-    inner = kinematics_message(sent)[5:]
+    inner = factory.kinematics_message(sent)[5:]
     state = struct.pack(">iB", 5 + len(other) + len(inner), 16) + other + inner
     stream = struct.pack(">iBi", 9, 20, 1) + struct.pack(">iB", 17, 16) + other + state
-    with socket.create_server((own_address, PRIMARY_PORT)) as server:
+    with socket.create_server((own_address, factory.PRIMARY_PORT)) as server:
         def serve() -> None:
             for end in (len(stream), 40, 0):
                 theirs, _ = server.accept()
@@ -164,19 +158,19 @@ def test_the_arms_own_dimensions_are_read_from_its_controller(own_address):
                     for part in (stream[:end // 2], stream[end // 2:end]):
                         theirs.sendall(part)
         threading.Thread(target=serve, daemon=True).start()
-        found = read_calibration(own_address)
-        assert read_calibration(own_address) is None and read_calibration(own_address) is None
+        found = factory.read_calibration(own_address)
+        assert [factory.read_calibration(own_address) for _ in range(2)] == [None, None]
     assert found.checksums == sent.checksums
     joints = np.array([0.3, -1.2, 1.4, -1.0, -1.5, 0.4])
     assert found.forward(joints) == pytest.approx(arm.forward(joints), abs=1e-12)
     off, turned = found.off_nominal(ARMS["ur5e"], joints)
     assert 1e-3 < off < 0.02 and turned < 1e-6
-    assert read_calibration(own_address) is None
+    assert factory.read_calibration(own_address) is None
 
 
 def test_a_tool_off_by_five_millimetres_shows_in_an_older_controller_too():
     """Nominal dimensions explain a centimetre; those that the controller reports, nothing."""
-    own = one_arm(ARMS["ur5"], 0.004, np.random.default_rng(1))
+    own = factory.one_arm(ARMS["ur5"], 0.004, np.random.default_rng(1))
     joints = np.array([0.3, -1.2, 1.4, -1.0, -1.5, 0.4])
     cell = Cell(robot={"model": "ur5"}, base={"pose": (0,) * 6},
                 tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)}, sensor={"kind": "ft300"})
@@ -184,6 +178,6 @@ def test_a_tool_off_by_five_millimetres_shows_in_an_older_controller_too():
     def told(tool: tuple) -> list[str]:
         pose = pose_vectors(own.forward(joints) @ matrices(np.array(tool)))
         sample = Sample(0.0, 0.0, joints, np.zeros(6), pose, np.zeros(6), np.zeros(6), 7, 1, 1, 1.0)
-        return [each.what for each in differences(cell, sample, FactoryCalibration.of(own))]
+        return [each.what for each in differences(cell, sample, factory.FactoryCalibration.of(own))]
     assert told((0, 0, 0.15, 0, 0, 0)) == []
     assert told((0.005, 0, 0.15, 0, 0, 0)) == ["tool centre point"]

@@ -72,6 +72,18 @@ def test_every_fault_is_noticed_by_a_stepped_driver(request, name):
     require_standstill(name, provoke(name, robot, cell_for(robot.address, robot.model)))
 
 
+def test_a_popup_stops_the_path_for_good(stepped):
+    """Nothing goes on when it is closed."""
+    with RobotLink(cell_for(stepped.address)) as link:
+        set_off(stepped, link, straight(stepped, (0.0, 0.2, 0.0)))
+        stepped.ask("popup", text="Check the gripper")
+        assert "program" in link.wait("stopped", seconds=5)["reason"]
+        stepped.rest(0.5)
+        stood = stepped.ask("close_popup")["joints"]
+        stepped.rest(0.5)
+        assert stepped.state["joints"] == stood
+
+
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(e_series, direction, moving):

@@ -6,15 +6,8 @@ import pytest
 from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.robot import recorder
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.recorder import (
-    LOOKED_M,
-    NUDGE_M,
-    PredictedPull,
-    PullPlausibility,
-    nudge_direction,
-    off_axis,
-)
 from limber.stages.pulls.record_nudge import nudge
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6})
@@ -39,7 +32,8 @@ def judged(samples: np.ndarray, factor: float | None, farthest: float = 0.01,
            ) -> tuple[str | None, float]:
     """The doubt, and after which way [m] it came."""
     ways = np.array([0.0, 0.0035, 0.007, farthest])
-    doubt = PullPlausibility(CELL, PredictedPull(ways, ways[:, None] * STIFF, factor))
+    pull = recorder.PredictedPull(ways, ways[:, None] * STIFF, factor)
+    doubt = recorder.PullPlausibility(CELL, pull)
     for batch in np.array_split(samples, len(samples) // 10):
         if doubt.take(batch):
             return doubt.reason, float(np.linalg.norm(batch[-1, 1:4] - samples[0, 1:4]))
@@ -68,7 +62,7 @@ def test_a_slow_slip_is_noticed_within_ten_millimetres_of_it(after, speed):
     for seed in range(5):
         reason, way = judged(slipping(0.1, after, speed, seed), None, farthest=0.025)
         assert reason is not None and "slips slowly" in reason
-        assert after < way <= after + LOOKED_M
+        assert after < way <= after + recorder.LOOKED_M
 
 
 @pytest.mark.parametrize("share, speed", [(1.0, 0.03), (0.8, 0.01), (1.3, 0.03)])
@@ -93,7 +87,7 @@ def test_a_wrong_sensor_is_noticed_in_the_first_ten_millimetres(response, factor
     for seed in range(5):
         reason, way = judged(rows(response, seed=seed), factor)
         assert reason is not None and told in reason
-        assert way <= LOOKED_M + 3e-4
+        assert way <= recorder.LOOKED_M + 3e-4
 
 
 @pytest.mark.parametrize("factor", [None, 2.0])
@@ -112,11 +106,11 @@ def test_a_force_along_the_branch_itself_makes_no_size_wrong():
     """A model a few degrees off predicts one where there is none; what is across it still counts.
     """
     ways = np.array([0.0, 0.0035, 0.007, 0.01])
-    askew = PredictedPull(ways, ways[:, None] * (STIFF + [0.0, 0.0, 400.0]), 2.0,
+    askew = recorder.PredictedPull(ways, ways[:, None] * (STIFF + [0.0, 0.0, 400.0]), 2.0,
                           np.diag([1.0, 1.0, 0.0]))
     for seed in range(5):
-        assert PullPlausibility(CELL, askew).take(rows(np.eye(3), seed=seed)) is None
-        told = PullPlausibility(CELL, askew).take(rows(0.1 * np.eye(3), seed=seed))
+        assert recorder.PullPlausibility(CELL, askew).take(rows(np.eye(3), seed=seed)) is None
+        told = recorder.PullPlausibility(CELL, askew).take(rows(0.1 * np.eye(3), seed=seed))
         assert told is not None and "smaller" in told
 
 
@@ -128,7 +122,8 @@ def test_moduli_that_are_not_known_make_no_size_wrong():
 def test_a_force_that_is_left_at_the_end_is_told():
     """Three newtons of drift; what noise and the branch leave is not told."""
     ways = np.array([0.0, 0.01])
-    doubt = PullPlausibility(CELL, PredictedPull(ways, ways[:, None] * STIFF, None))
+    pull = recorder.PredictedPull(ways, ways[:, None] * STIFF, None)
+    doubt = recorder.PullPlausibility(CELL, pull)
     out = rows(np.eye(3))
     doubt.take(out)
     back = out[:20].copy()
@@ -143,9 +138,10 @@ def test_a_tool_off_by_five_millimetres_is_told_before_a_pull():
     place = np.array([0.5, 0.0, 0.3])
     good = Cell(robot={"model": "ur5e"}, base={
         "pose": (0,) * 6, "position_sigma_m": 6e-4, "rotation_sigma_rad": 1e-3})
-    assert "5.0 mm off the branch's axis; the calibration explains 3.7" in off_axis(
+    assert "5.0 mm off the branch's axis; the calibration explains 3.7" in recorder.off_axis(
         good, place, 0.005)
-    assert off_axis(good, place, 0.003) is None and off_axis(CELL, place, 0.005) is None
+    assert recorder.off_axis(good, place, 0.003) is None
+    assert recorder.off_axis(CELL, place, 0.005) is None
 
 
 def seen_along(way: np.ndarray, response: np.ndarray, farthest: float, seed: int) -> str | None:
@@ -159,7 +155,8 @@ def seen_along(way: np.ndarray, response: np.ndarray, farthest: float, seed: int
         (len(ways), 3))
     samples[:, 13:16] = samples[:, 7:10]
     places = np.array([0.0, farthest])
-    doubt = PullPlausibility(CELL, PredictedPull(places, 60.0 * places[:, None] * way, None))
+    pull = recorder.PredictedPull(places, 60.0 * places[:, None] * way, None)
+    doubt = recorder.PullPlausibility(CELL, pull)
     for batch in np.array_split(samples, len(samples) // 10):
         doubt.take(batch)
     return doubt.reason
@@ -171,13 +168,13 @@ def test_axes_exchanged_about_the_pull_itself_show_in_a_nudge_across_it():
     for seed in range(10):
         axis = np.cross(diagonal, np.random.default_rng(100 + seed).standard_normal(3))
         stiffness = np.eye(3) + 99 * np.outer(axis, axis) / (axis @ axis)
-        side = nudge_direction(diagonal, stiffness)
+        side = recorder.nudge_direction(diagonal, stiffness)
         # Across the pull, and not along the branch, which is stiff.
         assert side @ diagonal == pytest.approx(0, abs=1e-12)
         assert side @ axis == pytest.approx(0, abs=1e-12)
         assert seen_along(diagonal, SWAPPED, 0.01, seed) is None
-        assert "predicted one: the sensor's" in seen_along(side, SWAPPED, NUDGE_M, seed)
-        assert seen_along(side, np.eye(3), NUDGE_M, seed) is None
+        assert "predicted one: the sensor's" in seen_along(side, SWAPPED, recorder.NUDGE_M, seed)
+        assert seen_along(side, np.eye(3), recorder.NUDGE_M, seed) is None
 
 
 def test_a_nudge_goes_across_and_back_on_the_side_that_is_free():

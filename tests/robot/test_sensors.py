@@ -10,15 +10,7 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.geometry.rigid_kernels import turned_wrench, weight_wrench
-from limber.robot.driver.force_samples import (
-    FT300_PORT,
-    ControllerSensor,
-    Ft300Sensor,
-    Reading,
-    WrenchChain,
-    open_sensor,
-    parsed_message,
-)
+from limber.robot.driver import force_samples
 from limber.robot.interface import Sample
 
 TOOL = (0.02, -0.01, 0.15, 0.3, 0.1, -0.2)
@@ -36,15 +28,15 @@ def sample_at(pose, wrench=(0.0,) * 6, clock=1.0) -> Sample:
                   np.asarray(wrench, float), 7, 1, 2, 1.0)
 
 
-def reading_of(wrench) -> Reading:
-    return Reading(np.asarray(wrench, float), 0.0, np.asarray(wrench, float))
+def reading_of(wrench) -> force_samples.Reading:
+    return force_samples.Reading(np.asarray(wrench, float), 0.0, np.asarray(wrench, float))
 
 
 @pytest.mark.parametrize("kind", ["controller", "ft300"])
 def test_every_sensor_gives_the_wrench_of_the_gripper_on_the_branch(kind):
     """A known wrench on the branch, taken through each sensor's own frame and sign."""
     cell = cell_with(kind=kind, pose=(0.01, 0.02, 0.03, 0.1, -0.4, 0.9))
-    chain = WrenchChain(cell)
+    chain = force_samples.WrenchChain(cell)
     rng = np.random.default_rng(4)
     pose = np.r_[rng.normal(size=3), 0.8, -0.4, 1.1]
     on_branch = rng.normal(size=6)
@@ -52,7 +44,7 @@ def test_every_sensor_gives_the_wrench_of_the_gripper_on_the_branch(kind):
     flange = tip @ np.linalg.inv(matrices(np.array(TOOL)))
     if kind == "controller":
         in_base = -np.r_[base[:3, :3].T @ on_branch[:3], base[:3, :3].T @ on_branch[3:]]
-        reading = ControllerSensor(cell).read(sample_at(pose, in_base))
+        reading = force_samples.ControllerSensor(cell).read(sample_at(pose, in_base))
     else:
         sensor = flange @ matrices(np.array(cell.sensor.pose))
         rotation = (base @ sensor)[:3, :3].T
@@ -70,11 +62,11 @@ def test_every_sensor_gives_the_wrench_of_the_gripper_on_the_branch(kind):
 def test_the_tare_takes_the_bias_and_the_weight_goes_with_every_turn():
     """Tared in one orientation, a bare gripper reads nothing in any other."""
     cell = cell_with(kind="ft300")
-    chain = WrenchChain(cell)
+    chain = force_samples.WrenchChain(cell)
     bias = np.array([3.0, -1.0, 4.0, 0.1, 0.2, -0.1])
     rng = np.random.default_rng(0)
 
-    def reading(pose) -> Reading:
+    def reading(pose) -> force_samples.Reading:
         flange = matrices(np.asarray(pose)) @ np.linalg.inv(matrices(np.array(TOOL)))
         weight = weight_wrench(0.9, np.array([0, 0, 0.06]), flange[:3, :3])
         return reading_of(weight + bias + 0.05 * rng.standard_normal(6))
@@ -92,7 +84,7 @@ def test_the_tare_takes_the_bias_and_the_weight_goes_with_every_turn():
 
 
 def test_a_touched_gripper_is_not_tared():
-    chain = WrenchChain(cell_with())
+    chain = force_samples.WrenchChain(cell_with())
     chain.start_tare()
     for k in range(100):
         chain.wrench(sample_at(np.zeros(6)), reading_of(np.full(6, 0.1 * k)))
@@ -104,13 +96,13 @@ def test_a_touched_gripper_is_not_tared():
 
 @pytest.mark.slow
 def test_a_reading_at_the_end_of_the_range_is_no_number_to_trust():
-    chain = WrenchChain(cell_with(force_range_n=50.0))
+    chain = force_samples.WrenchChain(cell_with(force_range_n=50.0))
     now, _ = chain.wrench(sample_at(np.zeros(6)), reading_of(np.r_[50.0, np.zeros(5)]))
     assert not np.isfinite(now).any()
 
 
 def test_the_smoothed_wrench_is_late_by_what_it_says():
-    chain = WrenchChain(cell_with(), count=5)
+    chain = force_samples.WrenchChain(cell_with(), count=5)
     slope = 2.0
     for k in range(50):
         sample = sample_at(np.zeros(6), clock=0.002 * k)
@@ -123,7 +115,7 @@ def test_the_smoothed_wrench_is_late_by_what_it_says():
     (" 1.0 , 2.0 , -3.5 , 0.1 , 0.2 , 0.3 ", True), ("1,2,3,4,5", False),
     ("1,2,3,4,5,6,7", False), ("1,2,3,,5,6", False), ("a,b,c,d,e,f", False)])
 def test_torn_messages_are_dropped(text, good):
-    assert (parsed_message(text) is not None) == good
+    assert (force_samples.parsed_message(text) is not None) == good
 
 
 def test_ft300_messages_in_any_pieces(own_address):
@@ -131,10 +123,10 @@ def test_ft300_messages_in_any_pieces(own_address):
     sent = [f"( {k} , {-k} , 3.0 , 0.1 , 0.2 , 0.3 )" for k in range(100)]
     data, rng = "".join(sent).encode(), np.random.default_rng(0)
     cuts = np.sort(rng.choice(len(data), 60, replace=False))
-    with socket.create_server((own_address, FT300_PORT)) as server:
+    with socket.create_server((own_address, force_samples.FT300_PORT)) as server:
         cell = Cell(robot={"model": "ur5", "address": own_address}, base={"pose": (0,) * 6},
                     sensor={"kind": "ft300"})
-        sensor = Ft300Sensor(cell)
+        sensor = force_samples.Ft300Sensor(cell)
         peer, _ = server.accept()
         sample = sample_at(np.zeros(6))
         assert np.isnan(sensor.read(sample).wrench).all()
@@ -153,14 +145,14 @@ def test_ft300_messages_in_any_pieces(own_address):
 
 def test_without_a_sensor_nothing_is_moved():
     with pytest.raises(InputError, match="cannot feel"):
-        open_sensor(cell_with(kind="none"))
+        force_samples.open_sensor(cell_with(kind="none"))
     cb3 = Cell(robot={"model": "ur5"}, base={"pose": (0,) * 6})
     with pytest.raises(InputError, match="motor currents"):
-        open_sensor(cb3)
+        force_samples.open_sensor(cb3)
 
 
 def test_a_missing_ft300_is_told(own_address):
     cell = Cell(robot={"model": "ur5", "address": own_address}, base={"pose": (0,) * 6},
                 sensor={"kind": "ft300"})
     with pytest.raises(WorkError, match="63351"):
-        open_sensor(cell)
+        force_samples.open_sensor(cell)

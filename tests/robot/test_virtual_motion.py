@@ -98,7 +98,7 @@ def test_out_of_reach_is_a_protective_stop_not_a_motion(registers):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("event", ["protective_stop", "emergency_stop", "local", "dashboard"])
+@pytest.mark.parametrize("event", ["protective_stop", "emergency_stop", "local", "stop", "popup"])
 def test_every_stop_brings_the_arm_to_rest(registers, event):
     """From 0.1 m/s within 30 ms and 2 mm; nothing moves afterwards, whatever is written."""
     controller = registers.controller
@@ -107,8 +107,8 @@ def test_every_stop_brings_the_arm_to_rest(registers, event):
     assert np.linalg.norm(controller.tool_speed[:3]) > 0.09
     {"protective_stop": lambda: controller.protective_stop("test"),
      "emergency_stop": controller.emergency_stop,
-     "local": lambda: controller.set_remote(False),
-     "dashboard": lambda: controller.stop_program("test")}[event]()
+     "local": lambda: controller.set_remote(False), "popup": lambda: controller.popup("test"),
+     "stop": lambda: controller.stop_program("test")}[event]()
     registers.wait(0.03)
     assert not np.any(controller.speeds)
     assert np.linalg.norm(controller.pose - begin) < 2e-3
@@ -116,6 +116,24 @@ def test_every_stop_brings_the_arm_to_rest(registers, event):
     registers.servo(SERVO_POSE, moved(registers, 0, 0.1, 0, 0, 0, 0))
     registers.wait(0.3)
     assert controller.pose == pytest.approx(rest, abs=1e-12)
+
+
+@pytest.mark.parametrize("model", ["ur5e", "ur5"])
+def test_a_hand_leads_the_arm_where_nothing_else_may_move_it(model):
+    """An e-Series in local control only; none while a program runs."""
+    registers = Registers(controller := Controller(model))
+    home, there = controller.joints, controller.joints + [0.3, 0, -0.2, 0, 0, 0.1]
+    controller.freedrive(there)
+    registers.wait(0.1)
+    assert np.array_equal(controller.joints, home)
+    controller.stop_program("test")
+    controller.freedrive(there)
+    registers.wait(0.1)
+    assert np.array_equal(controller.joints, home) == (model == "ur5e")
+    controller.set_remote(False)
+    controller.freedrive(there)
+    registers.wait(2.1)
+    assert controller.joints == pytest.approx(there) and not controller.speeds.any()
 
 
 def test_watchdog_stops_the_program_after_its_time(registers):

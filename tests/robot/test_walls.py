@@ -10,14 +10,7 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.trajectory import (
-    ExpectedWrench,
-    Trajectory,
-    along,
-    contact_speed,
-    densely,
-    speed_within,
-)
+from limber.robot.motion import trajectory
 from limber.robot.operator_decisions import _force_left
 from limber.robot.virtual.controller import Controller
 from limber.stages.pulls.record_path import there_and_back
@@ -28,16 +21,16 @@ CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
 
 
 def facing_a_wall(speed: float, stiffness: float, *, predicted: bool,
-                  ) -> tuple[SteppedRobot, Wall, Trajectory]:
+                  ) -> tuple[SteppedRobot, Wall, trajectory.Trajectory]:
     """A way of 60 mm at ``speed`` and a wall 30 mm away: the robot, the wall, the way."""
     controller = Controller("ur5e", seed=1)
     controller.set_tool(np.r_[TOOL, 0, 0, 0])
     start = controller.pose.copy()
     wall = Wall(TOOL, np.array([0, -1.0, 0]), start[:3] + [0, 0.03, 0], stiffness)
     controller.load = wall
-    poses = densely(np.array([start, start + [0, 0.06, 0, 0, 0, 0]]))
-    path = Trajectory(along(poses, speed, 0.3), poses,
-                      ExpectedWrench.nothing(poses) if predicted else None)
+    poses = trajectory.densely(np.array([start, start + [0, 0.06, 0, 0, 0, 0]]))
+    path = trajectory.Trajectory(trajectory.along(poses, speed, 0.3), poses,
+                      trajectory.ExpectedWrench.nothing(poses) if predicted else None)
     return SteppedRobot(controller), wall, path
 
 
@@ -73,9 +66,9 @@ def stating(stiffness: float) -> Cell:
 def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(stiffness, predicted):
     """A soft one needs no less than the cell's speed; a rigid one, the default, is met slowly."""
     cell, told = CELL if stiffness is None else stating(stiffness), []
-    speed = speed_within(cell, 0.05, told.append)
+    speed = trajectory.speed_within(cell, 0.05, told.append)
     assert (speed == 0.05) == (stiffness == 5e3) == (not told)
-    assert speed == min(0.05, contact_speed(cell)) > 0.005
+    assert speed == min(0.05, trajectory.contact_speed(cell)) > 0.005
     if told:
         assert f"at {1e3 * speed:.1f} mm/s instead of 50.0 mm/s" in told[0]
         assert "state limits.contact_n_per_m" in told[0]
@@ -89,7 +82,7 @@ def test_a_motion_of_a_cell_that_states_no_stiffness_meets_rigid_things_slowly()
     frames = np.tile(CELL.arm.forward(np.array(CELL.arm.home)) @ matrices(
         np.array(CELL.tool.grasp_pose)), (2, 1, 1))
     frames[1, :3, 3] += [0, 0.03, 0]
-    most = contact_speed(CELL)
+    most = trajectory.contact_speed(CELL)
     assert 0.005 < most < 0.01
     for cell, speed in ((CELL, most), (stating(1e3), 0.05)):
         pull = there_and_back(cell, frames, speed=0.05, cycles=1, pause=0.1)
@@ -98,10 +91,10 @@ def test_a_motion_of_a_cell_that_states_no_stiffness_meets_rigid_things_slowly()
 
 def test_a_contact_that_no_speed_is_slow_enough_for_is_refused():
     with pytest.raises(InputError, match="even at 1 mm/s"):
-        contact_speed(stating(1e7))
+        trajectory.contact_speed(stating(1e7))
     slow = CELL.model_copy(update={"robot": CELL.robot.model_copy(update={"model": "ur5"}),
                                    "sensor": CELL.sensor.model_copy(update={"kind": "ft300"})})
-    assert contact_speed(slow) < contact_speed(CELL)
+    assert trajectory.contact_speed(slow) < trajectory.contact_speed(CELL)
 
 
 @contextmanager

@@ -22,20 +22,8 @@ from limber.core.errors import LimberError, SafetyStop, WorkError
 from limber.geometry.rigid_kernels import frame_of, turned_wrench
 from limber.robot.interface import Reading, Sample
 from limber.robot.motion.trajectory import Trajectory
+from limber.robot.ros import messages
 from limber.robot.ros.bridge import SECONDS, Bridge, call
-from limber.robot.ros.messages import (
-    END,
-    FOLLOW,
-    JOG,
-    JOINT_STATE,
-    RUNNING,
-    STATUS_KINDS,
-    STOP,
-    JointStates,
-    goal_of,
-    status_of,
-    wrench_of,
-)
 from limber.robot.ros.topics import WRENCH, Topics, grip_by_action, wrench_topic
 
 BEAT_SECONDS = 0.1
@@ -66,7 +54,7 @@ class RosSensor:
 
     def take(self, message: dict[str, Any]) -> None:
         """Take a stamped wrench."""
-        self._last, self._arrived = wrench_of(message), time.monotonic()
+        self._last, self._arrived = messages.wrench_of(message), time.monotonic()
 
     def read(self, sample: Sample) -> Reading:
         """Return the newest reading."""
@@ -88,8 +76,8 @@ class RosControl:
         self._cell, self._topics = cell, Topics.of_cell(cell)
         wrench = wrench_topic(cell, self._topics.wrench)
         self._bridge = bridge or Bridge(cell.robot.address)
-        self._states, self.sensor = JointStates(cell, self._topics.prefix), RosSensor(cell)
-        self._status = {getattr(self._topics, name): name for name in STATUS_KINDS
+        self._states, self.sensor = messages.JointStates(cell, self._topics.prefix), RosSensor(cell)
+        self._status = {getattr(self._topics, name): name for name in messages.STATUS_KINDS
                         if cell.arm.controller == "ur"}
         self._reported: dict[str, Any] = {}
         self._recent, self._waiting = deque[Sample](maxlen=_KEPT), list[Sample]()
@@ -104,13 +92,13 @@ class RosControl:
         self._stood, self._stood_at, self._rests = (0.0, 0.0), np.zeros(0), np.zeros(0)
         self._takes = {self._topics.joint_states: self._take_joints,
                        wrench: self.sensor.take, self._topics.stop: self._take_stop}
-        for topic, kind in ((self._topics.joint_states, JOINT_STATE), (wrench, WRENCH),
-                            (self._topics.stop, STOP), (self._topics.end, END), *(
-                                (topic, STATUS_KINDS[name])
+        for topic, kind in ((self._topics.joint_states, messages.JOINT_STATE), (wrench, WRENCH),
+                            (self._topics.stop, messages.STOP), (self._topics.end, messages.END), *(
+                                (topic, messages.STATUS_KINDS[name])
                                 for topic, name in self._status.items())):
             self._bridge.subscribe(topic, kind)
-        self._bridge.advertise(self._topics.stop, STOP)
-        self._bridge.advertise(self._topics.end, END)
+        self._bridge.advertise(self._topics.stop, messages.STOP)
+        self._bridge.advertise(self._topics.end, messages.END)
         try:
             self._require_topics(wrench)
         except BaseException:
@@ -174,7 +162,7 @@ class RosControl:
         kind, topic = message.get("op"), str(message.get("topic"))
         if kind == "publish":
             if (name := self._status.get(topic)) is not None:
-                self._reported[name] = status_of(name, message["msg"])
+                self._reported[name] = messages.status_of(name, message["msg"])
             elif (taken := self._takes.get(topic)) is not None:
                 taken(message["msg"])
         elif kind == "action_result" and message.get("id") == self._goal:
@@ -184,7 +172,7 @@ class RosControl:
                       "of Humble (1.3), moves no arm: update rosbridge_suite")
 
     def _take_joints(self, message: dict[str, Any]) -> None:
-        sample = self._states.sample(message, time.monotonic(), RUNNING | self._reported)
+        sample = self._states.sample(message, time.monotonic(), messages.RUNNING | self._reported)
         if sample is not None:
             self._recent.append(sample)
             self._waiting.append(sample)
@@ -224,7 +212,7 @@ class RosControl:
         self._rests = _rests(trajectory)
         self._stood, self._stood_at = (0.0, last.clock), last.joints
         self._unheard, self._beat, self._cancels_until = 0, -np.inf, None
-        self._asked = goal_of(trajectory, self._states.ordered, since, last.joints)
+        self._asked = messages.goal_of(trajectory, self._states.ordered, since, last.joints)
 
     def progress(self, sample: Sample) -> tuple[float, str | None]:
         """Return the time along the trajectory where the arm is nearest to it [s], and how it
@@ -293,7 +281,7 @@ class RosControl:
         self._goal, asked, self._asked = f"limber-{self._goals}", self._asked, None
         self._stood = 0.0, self._recent[-1].clock
         self._bridge.send(op="send_action_goal", id=self._goal, action=self._topics.trajectory,
-                          action_type=FOLLOW, feedback=False, args=asked)
+                          action_type=messages.FOLLOW, feedback=False, args=asked)
 
     def _say(self, stop: bool) -> None:
         self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": stop})
@@ -385,7 +373,7 @@ class RosServo(RosControl):
     def __init__(self, cell: Cell, bridge: Bridge | None = None):
         super().__init__(cell, bridge)
         self._sent: tuple[np.ndarray, float] | None = None
-        self._bridge.advertise(self._topics.jog, JOG)
+        self._bridge.advertise(self._topics.jog, messages.JOG)
 
     def servo_joints(self, joints: np.ndarray) -> bool:
         """Send the speeds that bring the joints to their next angles [rad], shape [n], and back

@@ -140,7 +140,21 @@ class Servo:
         return self._commanded
 
 
-Motion = Servo | Braking
+class Led:
+    """A hand leads the arm to ``joints`` [rad], in so many ``seconds``; its force is not felt."""
+
+    def __init__(self, joints: np.ndarray, seconds: float):
+        self._joints, self._left, self.finished = joints, max(seconds, 1e-3), False
+
+    def step(self, joints: np.ndarray, speeds: np.ndarray, seconds: float, scale: float,
+             ) -> tuple[np.ndarray, np.ndarray]:
+        self.finished = self._left <= seconds
+        moved = min(seconds / self._left, 1.0) * (self._joints - joints)
+        self._left -= seconds
+        return joints + moved, 0.0 * moved if self.finished else moved / seconds
+
+
+Motion = Servo | Braking | Led
 
 
 def nearest_joints(arm: Arm, pose: np.ndarray, tool: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -323,7 +337,7 @@ class Controller:
         self.remote = True
         self.slider = 1.0
         self.program: ControlProgram | None = None
-        self.paused = False
+        self.paused = self.shows_popup = False
         self.motion: Motion | None = None
         self.watchdog: tuple[float, int] | None = None
         self.inputs: dict[str, Any] = {}
@@ -511,6 +525,31 @@ class Controller:
         """Hold the program and brake the arm; playing it continues with the next command."""
         self.paused = True
         self._brake()
+
+    def popup(self, text: str) -> None:
+        """Show a blocking popup on the pendant: the program "does not continue (behind the popup)"
+        (Universal_Robots_ExternalControl_URCap, pull request 3) until it is closed."""
+        self.say(f"popup: {text}")
+        self.shows_popup = True
+        if self.program is not None and not self.paused:
+            self.pause_program()
+
+    def close_popup(self) -> None:
+        """Close it, at the pendant or by the dashboard's ``close popup``: the program goes on,
+        unless a safety function has stopped it since."""
+        if self.shows_popup:
+            self.shows_popup, self.paused = False, not self.can_move
+
+    def freedrive(self, joints: Sequence[float], seconds: float = 2.0) -> None:
+        """Hold the button on the pendant and lead the arm by hand to ``joints`` [rad], if nothing
+        else may move it: in this mode it follows no trajectory (URScript, ``freedrive_mode``), and
+        in an e-Series' remote control the pendant starts no motion, "including freedrive"
+        (Universal_Robots_ROS2_Driver, "Operation modes")."""
+        if not self.can_move or self.program is not None or (
+                self.remote and self.arm.measures_force):
+            self.say("freedrive refused: remote control, a program runs or the arm is stopped")
+            return
+        self.motion = Led(_six(joints), seconds)
 
     def set_tool(self, offset: np.ndarray) -> None:
         """Set the tool's pose in the flange's frame [m, rad]."""

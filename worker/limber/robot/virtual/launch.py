@@ -194,11 +194,10 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     **{name: _set(name) for name in (
         "silent", "delay", "ft300_fault", "slider", "payload", "joints_nan")},
     **{name: _do(name) for name in ("safeguard_stop", "power_off", "emergency_stop", "unlock",
-                                    "reset_emergency", "stand")},
-    "state": lambda server: None,
-    "cut": lambda server: server.cut(),
-    "frozen_sensor": _set("frozen"), "sensor_nan": _set("nan"),
-    "added_wrench": _set_force,
+                                    "reset_emergency", "stand", "popup", "close_popup",
+                                    "freedrive")},
+    "state": lambda server: None, "cut": lambda server: server.cut(),
+    "frozen_sensor": _set("frozen"), "sensor_nan": _set("nan"), "added_wrench": _set_force,
     "clock_jump": _set("clock_offset"), "outputs": _set("digital_outputs"),
     "tool": _do("set_tool"),
     "clock_stands": lambda server, value=True: server.controller.hold_clock(bool(value)),
@@ -211,5 +210,4 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "break": lambda server: server.controller.load.lose("broken"),
     "slip": lambda server, part: server.controller.load.slide(part),
     "creep": lambda server, part: setattr(server.controller.load, "creep", float(part)),
-    "stop_program": lambda server: server.controller.stop_program("test"),
-}
+    "stop_program": lambda server: server.controller.stop_program("test")}

@@ -30,7 +30,7 @@ _STATES = {RuntimeState.STOPPED: "STOPPED", RuntimeState.PLAYING: "PLAYING",
            RuntimeState.PAUSED: "PAUSED"}
 # Commands that change something are refused in local control, as on the e-Series.
 _CHANGES = ("play", "stop", "pause", "load", "power on", "power off", "brake release",
-            "unlock protective stop", "restart safety", "shutdown", "close safety popup")
+            "unlock protective stop", "restart safety", "shutdown", "close popup")
 _CB3 = 3
 _REFUSED = "Command is not allowed due to safety reasons"
 
@@ -43,8 +43,6 @@ def answer(controller: Controller, line: str) -> str:
     reply = _QUESTIONS.get(command) or _ACTIONS.get(command)
     if reply is not None:
         return reply(controller)
-    if command.startswith("load "):
-        return f"Loading program: {line.strip()[5:]}"
     if command.startswith(("popup", "addtolog")):
         controller.say(line.strip())
         return "showing popup" if command.startswith("popup") else "Added log message"
@@ -84,9 +82,7 @@ def _power(mode: RobotMode, reply: str) -> Callable[[Controller], str]:
 
 
 def _unlock(controller: Controller) -> str:
-    if controller.safety_mode != SafetyMode.PROTECTIVE_STOP:
-        return "Protective stop releasing"
-    if controller.unlock():
+    if controller.safety_mode != SafetyMode.PROTECTIVE_STOP or controller.unlock():
         return "Protective stop releasing"
     return "Cannot unlock protective stop until 5s after occurrence"
 
@@ -100,18 +96,14 @@ def _remote(controller: Controller) -> str:
 
 _QUESTIONS = {
     "polyscopeversion": lambda c: f"URSoftware {'.'.join(map(str, c.version))} (Jan 01 2022)",
-    "version": lambda c: ".".join(map(str, c.version)),
     "get serial number": lambda c: "20220000001",
     "get robot model": lambda c: c.arm.name.upper().rstrip("E"),
     "is in remote control": _remote,
-    "get operational mode": lambda c: "NONE",
     "robotmode": lambda c: f"Robotmode: {_MODES[c.robot_mode]}",
     "safetymode": lambda c: f"Safetymode: {c.safety_mode.name}",
     "safetystatus": lambda c: f"Safetystatus: {c.safety_mode.name}",
     "running": lambda c: f"Program running: {str(c.runtime_state == RuntimeState.PLAYING).lower()}",
     "programstate": lambda c: f"{_STATES[c.runtime_state]} rtde_control",
-    "get loaded program": lambda c: "No program loaded",
-    "isprogramsaved": lambda c: "true rtde_control",
 }
 _ACTIONS = {
     "stop": _stop, "pause": _pause, "play": _play,
@@ -119,8 +111,7 @@ _ACTIONS = {
     "power off": _power(RobotMode.POWER_OFF, "Powering off"),
     "brake release": _power(RobotMode.RUNNING, "Brake releasing"),
     "unlock protective stop": _unlock,
-    "close popup": lambda c: "closing popup",
-    "close safety popup": lambda c: "closing safety popup",
+    "close popup": lambda c: c.close_popup() or "closing popup",
     "restart safety": lambda c: c.reset_emergency() or "Restarting safety",
 }
 
