@@ -2,8 +2,8 @@
 Tetrahedra at a fork
 ====================
 
-The tetrahedra of a branch as they are solved: quadratic ones, swept along the axes, and joined at
-forks.
+The 896 tetrahedra of a branch as they are solved: quadratic ones, of ten nodes each, swept along
+the axes and joined at forks.
 """
 
 import matplotlib.pyplot as plt
@@ -14,6 +14,7 @@ import limber
 
 branch = limber.open("../../../blend_files/bending_branch")
 mesh, camera = branch.mesh, Camera(azimuth=-5)
+assert mesh.tets.shape == (896, 10)
 faces = outer_faces(mesh)
 axes_found = branch.skeleton
 fork = axes_found.nodes[axes_found.parent[np.argmax(axes_found.order == 1)]]

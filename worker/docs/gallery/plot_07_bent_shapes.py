@@ -2,9 +2,9 @@
 A branch bent step by step
 ==========================
 
-Equilibria with the grasp led aside, coloured by the largest principal strain. The grasp holds a
-position and leaves the branch free to turn in it; at each step it keeps the distance from the base
-that costs the least energy.
+Equilibria with the grasp led aside by up to 24 degrees, coloured by the largest principal strain,
+which reaches 3.1 %. The grasp holds a position and leaves the branch free to turn in it. At each
+step it keeps the distance from the base that costs the least energy; the last force is 1.18 N.
 """
 
 import matplotlib.pyplot as plt
@@ -45,6 +45,8 @@ for angle in np.radians([0, 8, 16, 24]):
     tip = camera(shapes[-1])[0][np.argmax(np.linalg.norm(shapes[-1] - base, axis=1))]
     axes.annotate(f"{np.linalg.norm(state.reaction_force):.2f} N", tip, xytext=(6, 4),
                   textcoords="offset points")
+assert round(strain.max(), 1) == 3.1
+assert round(np.linalg.norm(state.reaction_force), 2) == 1.18
 frame(axes, camera, *shapes)
 figure.colorbar(scale, ax=axes, label="largest principal strain [%]", shrink=0.8)
 plt.show()

@@ -3,8 +3,8 @@ The energy field
 ================
 
 Deformation energy over the position of the grasp, in the vertical plane of the branch. The valley
-is where the branch bends without being stretched; the cross is the grasp at rest. White dots
-are the solved poses near that plane.
+is where the branch bends without being stretched; the cross is the grasp at rest, where the energy
+is 0. The six white dots are the solved poses near that plane.
 """
 
 import matplotlib.pyplot as plt
@@ -24,6 +24,7 @@ levels = [0, 2, 5, 10, 20, 50, 100, 200, 500]
 filled = axes.contourf(1e3 * (rest[0] + across), 1e3 * (rest[2] + up), energy.T, levels,
                        cmap="viridis", extend="max", norm="symlog")
 near = np.abs(field.positions[:, 1] - rest[1]) < 0.15 * spread[1]
+assert near.sum() == 6 and abs(field.energy(rest[None])[0]) < 1e-9
 axes.plot(*(1e3 * field.positions[near][:, [0, 2]]).T, ".", color="white", ms=6,
           label="solved poses")
 axes.plot(1e3 * rest[0], 1e3 * rest[2], "x", color="#e08214", ms=11, mew=3, label="at rest")

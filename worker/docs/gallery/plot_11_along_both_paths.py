@@ -3,6 +3,7 @@ Energy, force and strain along both paths
 =========================================
 
 All values are of the finite elements along the paths, not of the field that the planner searched.
+The gentle path saves 34 % of the energy along the way; its largest strain is 1.5 %, not 2.0 %.
 """
 
 import matplotlib.pyplot as plt
@@ -15,6 +16,9 @@ folder = "../../../blend_files/bending_branch"
 tables = {key: np.genfromtxt(f"{folder}/plans/{name}.csv", delimiter=",", names=True)
           for key, name in (("baseline", "to-goal-baseline"), ("plan", "to-goal"))}
 plan = limber.open(folder).results["plan:to-goal"]
+
+assert round(plan.energy_saved) == 34
+assert [round(100 * tables[key]["strain"].max(), 1) for key in ("plan", "baseline")] == [1.5, 2.0]
 
 figure, rows = plt.subplots(3, 1, figsize=(7, 6.5), sharex=True, layout="constrained")
 for key, title in (("baseline", "shortest path"), ("plan", "gentle path")):

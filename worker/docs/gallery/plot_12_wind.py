@@ -2,8 +2,9 @@
 A branch in the wind
 ====================
 
-How far the tip of the branch moves, and how its largest strain grows, with the speed of a steady
-wind from the side. At rest the strain is that of its own weight. The drag is that of bare wood.
+How far the tip of the branch moves, and what its largest strain is, in a steady wind from the side:
+86 mm and 0.90 % at 10 m/s. At rest the strain is that of its own weight, 0.38 %. With the wind it
+falls first, to 0.34 % at 4 m/s. The drag is that of bare wood.
 """
 
 import shutil
@@ -24,6 +25,9 @@ with tempfile.TemporaryDirectory() as place:
         found = branch.load(wind=(float(speed), 0, 0), quiet=True)
         tips.append(1e3 * np.linalg.norm(found.tip_displacement))
         strains.append(100 * found.greatest_strain)
+
+assert round(tips[-1]) == 86
+assert [round(strains[k], 2) for k in (0, 2, 5)] == [0.38, 0.34, 0.90]
 
 figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
 axes.plot(speeds, tips, "o-", color="#1b9e77")
