@@ -33,15 +33,20 @@ def test_the_described_arm_moves_as_the_cells_does(model, tmp_path):
     assert arm.forward(joints) == pytest.approx(cell.arm.forward(joints), abs=1e-9)
     assert arm.joint_limits == pytest.approx(cell.arm.joint_limits)
     assert arm.joint_speed == pytest.approx(np.array(cell.arm.joint_speed))
-    assert list(arm.joint_names) == joint_names(cell.arm)
-    own, described = cell.arm.rods(joints[:1]), arm.rods(joints[:1])
-    for start, end, radius in zip(own.starts[0], own.ends[0], own.radii, strict=True):
-        same = (np.abs(described.radii - radius) < 1e-9) & (np.minimum(
-            np.abs(described.starts[0] - start).max(axis=1)
-            + np.abs(described.ends[0] - end).max(axis=1),
-            np.abs(described.starts[0] - end).max(axis=1)
-            + np.abs(described.ends[0] - start).max(axis=1)) < 1e-6)
-        assert same.any()
+    assert list(arm.joint_names) == joint_names(cell)
+    own, described = (np.column_stack([rods.starts[0] + rods.ends[0], rods.radii, np.abs(
+        rods.starts[0] - rods.ends[0])])
+                      for rods in (one.rods(joints[:1]) for one in (cell.arm, arm)))
+    assert np.abs(own[:, None] - described).max(axis=2).min(axis=1).max() < 1e-6
+
+
+def test_joints_of_a_urdf_file_keep_their_names_and_a_prefix_comes_before(tmp_path):
+    """Else a node that publishes TF would not find them in the joint states."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(cell_urdf(cell_of("ur5e")).replace("shoulder_pan_joint", "j1"))
+    assert joint_names(cell_of(str(path)))[:3] == ["j1", "shoulder_lift_joint", "elbow_joint"]
+    two = cell_of("ur5e").model_dump() | {"robot": {"model": "ur5e", "ros": {"prefix": "a_"}}}
+    assert '"a_elbow_joint"' in cell_urdf(Cell(**two))
 
 
 def test_base_gripper_camera_and_obstacles_are_in_the_branchs_frame():
@@ -68,7 +73,7 @@ def test_the_group_has_the_arms_joints_at_home():
     root = ElementTree.fromstring(cell_srdf(cell))
     assert root.find("group/chain").attrib == {"base_link": "base", "tip_link": "grasp"}
     told = {joint.get("name"): float(joint.get("value")) for joint in root.find("group_state")}
-    assert list(told) == joint_names(cell.arm)
+    assert list(told) == joint_names(cell)
     assert list(told.values()) == pytest.approx(cell.arm.home)
     pairs = [(each.get("link1"), each.get("link2")) for each in root.findall("disable_collisions")]
     assert ("base", "shoulder_pan_link") in pairs and ("tool0", "grasp") in pairs

@@ -26,6 +26,10 @@ def test_files_alone_are_checked_without_a_robot(branch_folder, tmp_path, capfd)
     path = cell_file(mesh, tmp_path)
     code, told = checked(capfd, path, "--offline")
     assert code == 2 and "none.stl" in told["error"]
+    path.write_text("robot = {model = 'ur5e', address = 'ws://a:9090'}\nsensor = {kind = 'ft300'}\n"
+                    "base = {pose = [0.6, 0, 0, 0, 0, 0]}\n")
+    code, told = checked(capfd, path, "--offline")
+    assert code == 2 and "states no sensor.topic" in told["error"]
     path.write_text("[robot]\nmodel = 'ur9'\n")
     assert checked(capfd, path, "--offline")[0] == 2
 

@@ -44,7 +44,7 @@ class RosDescribe(CellTool):
         cell, srdf = self.cell(), self.output.with_suffix(".srdf")
         write_atomically(self.output, cell_urdf(cell))
         write_atomically(srdf, cell_srdf(cell))
-        return {"urdf": str(self.output), "srdf": str(srdf), "joints": joint_names(cell.arm),
+        return {"urdf": str(self.output), "srdf": str(srdf), "joints": joint_names(cell),
                 "obstacles": len(cell.obstacles)}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from limber.cell.arm import Arm
 from limber.cell.cell_file import BoxEntry, Cell
+from limber.cell.urdf_arm import is_file
 from limber.core.numerics.rigid import matrices
 
 _EFFORT = 150.0  # N m; the file has to state one, and Limber limits forces, not torques
@@ -28,7 +29,7 @@ def cell_urdf(cell: Cell) -> str:
     _link(root, "branch")
     _fixed(root, "branch", "base", matrices(np.array(cell.base.pose)))
     _link(root, "base")
-    _arm(root, cell.arm)
+    _arm(root, cell.arm, joint_names(cell))
     tool = _link(root, "tool0")
     for part in cell.tool.parts:
         _capsule(tool, np.array(part.start_m), np.array(part.end_m), part.radius_m)
@@ -59,18 +60,19 @@ def cell_srdf(cell: Cell) -> str:
     group = ElementTree.SubElement(root, "group", name=_GROUP)
     ElementTree.SubElement(group, "chain", base_link="base", tip_link="grasp")
     home = ElementTree.SubElement(root, "group_state", name="home", group=_GROUP)
-    for name, angle in zip(joint_names(cell.arm), cell.arm.home, strict=True):
+    for name, angle in zip(joint_names(cell), cell.arm.home, strict=True):
         ElementTree.SubElement(home, "joint", name=name, value=f"{float(angle):.9g}")
-    chain = ["base", *link_names(cell.arm), "tool0", "grasp"]
-    for first, second in pairwise(chain):
+    for first, second in pairwise(["base", *link_names(cell.arm), "tool0", "grasp"]):
         ElementTree.SubElement(root, "disable_collisions", link1=first, link2=second,
                                reason="Adjacent")
     return _text(root)
 
 
-def joint_names(arm: Arm) -> list[str]:
-    """Return the names of an arm's joints in ROS, from the base on."""
-    return [name if "joint" in name else f"{name}_joint" for name in arm.ros_joints]
+def joint_names(cell: Cell) -> list[str]:
+    """Return the names of the arm's joints in ROS, from the base on; of a URDF file, its own."""
+    prefix, is_whole = cell.robot.ros.get("prefix", ""), is_file(cell.robot.model)
+    return [prefix + (name if is_whole or "joint" in name else f"{name}_joint")
+            for name in cell.arm.ros_joints]
 
 
 def link_names(arm: Arm) -> list[str]:
@@ -78,14 +80,13 @@ def link_names(arm: Arm) -> list[str]:
     return [name.removesuffix("_joint") + "_link" for name in arm.ros_joints]
 
 
-def _arm(root: Element, arm: Arm) -> None:
+def _arm(root: Element, arm: Arm, names: list[str]) -> None:
     """Add an arm's links and joints on the link ``base``, up to the flange ``tool0``."""
     zero = np.zeros(len(arm.joint_names))
     flange, slopes = arm.forward(zero), arm.jacobian(zero)
     links, before, place = link_names(arm), "base", np.zeros(3)
     speeds = np.broadcast_to(arm.joint_speed, zero.shape)
-    moved = _rods_of_links(arm)
-    for number, name in enumerate(joint_names(arm)):
+    for number, (name, moved) in enumerate(zip(names, _rods_of_links(arm), strict=True)):
         axis = slopes[3:, number]
         # The point of the axis nearest to the flange, in the base's frame.
         at = flange[:3, 3] - np.cross(slopes[:3, number], axis)
@@ -99,7 +100,7 @@ def _arm(root: Element, arm: Arm) -> None:
             limit |= {"lower": f"{low:.9g}", "upper": f"{high:.9g}"}
         ElementTree.SubElement(joint, "limit", limit)
         link = _link(root, links[number])
-        for start, end, radius in moved[number]:
+        for start, end, radius in moved:
             _capsule(link, start - at, end - at, radius)
         before, place = links[number], at
     _fixed(root, before, "tool0", _shifted(-place) @ flange)
@@ -127,11 +128,9 @@ def _capsule(link: Element, start: np.ndarray, end: np.ndarray, radius: float) -
     """Add a cylinder and its two round ends, in the link's frame."""
     for place in (start, end):
         _shape(link, _shifted(place), "sphere", radius=f"{radius:.9g}")
-    axis = end - start
-    length = float(np.linalg.norm(axis))
-    if length > 0.0:
+    if (length := float(np.linalg.norm(end - start))) > 0.0:
         frame = _shifted(0.5 * (start + end))
-        frame[:3, :3] = _along(axis / length)
+        frame[:3, :3] = _along((end - start) / length)
         _shape(link, frame, "cylinder", radius=f"{radius:.9g}", length=f"{length:.9g}")
 
 

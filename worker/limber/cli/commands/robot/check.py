@@ -22,7 +22,7 @@ def _from_files_line(values: Mapping[str, Any]) -> str:
     if not values["offline"]:
         return ""
     plan = values["plan"]
-    return (f"{values['cell_file']} describes a {values['arm']}; its base is known to "
+    return (f"{values['cell_file']} describes a {Path(values['arm']).name}; its base is known to "
             f"{1000 * values['base_position_sigma_m']:.1f} mm"
             f"{f', and the arm can follow {plan}' if plan else ''}. No robot was asked.")
 
@@ -58,8 +58,7 @@ class Check(CellTool):
                 Option("branch"), " FOLDER, and ", Option("plan"), " NAME if you want.")
         cell = self.cell()
         if reason := unweighed(cell):
-            progress.warn(f"{reason}. Weigh it before the arm moves a branch (limber robot "
-                          "weigh).")
+            progress.warn(f"{reason}. Weigh it before the arm moves a branch (limber robot weigh).")
         camera = _camera(cell, progress) if self.realsense else {}
         return camera | (_from_files(self, cell, progress) if self.offline
                          else _from_robot(cell, progress))
@@ -69,16 +68,19 @@ def _from_files(check: Check, cell: Cell, progress: Progress) -> dict[str, Any]:
     """Check a cell, its calibration and a plan without a robot."""
     from limber.cell.cell_file import check_branch
     from limber.cell.obstacles import cell_obstacles
+    from limber.robot.ros.topics import is_ros, wrench_topic
     from limber.stages.paths.execute import ExecutePlan, planned_motion
     from limber.store import Branch
 
     folder, plan = check.branch, check.plan
-    obstacles = cell_obstacles(cell, check.cell_file.parent)
+    if is_ros(cell):
+        wrench_topic(cell)
     for text in _not_stated(cell):
         progress.warn(text)
     result: dict[str, Any] = {
-        "arm": cell.arm.name, "obstacles": len(obstacles), "base_position_sigma_m":
-        cell.base.position_sigma_m, "base_rotation_sigma_rad": cell.base.rotation_sigma_rad,
+        "arm": cell.arm.name, "obstacles": len(cell_obstacles(cell, check.cell_file.parent)),
+        "base_position_sigma_m": cell.base.position_sigma_m,
+        "base_rotation_sigma_rad": cell.base.rotation_sigma_rad,
         "calibration_residual_m": cell.base.residual_m}
     if plan is None and folder is not None and (
             warning := check_branch(cell, Branch.read(folder).uuid, folder)):
@@ -140,9 +142,8 @@ def _from_robot(cell: Cell, progress: Progress) -> dict[str, Any]:
         progress.warn(f"{each}.")
     for warning in seen.implausible(cell):
         progress.warn(f"The force sensor: {warning}.")
-    computer = _computer(progress)
     force = seen.readings[:, :3]
-    return seen.facts | computer | {
+    return seen.facts | _computer(progress) | {
         "arm": cell.arm.name, "address": cell.robot.address,
         "payload_kg": cell.tool.mass_kg, "sensor": cell.sensor.kind,
         "differences": [vars(each) for each in seen.differences],
@@ -155,8 +156,7 @@ def _from_robot(cell: Cell, progress: Progress) -> dict[str, Any]:
 
 def _calibration(cell: Cell, seen: Observed) -> dict[str, Any] | None:
     """The arm's own dimensions as its controller reports them, and what they change here."""
-    own = seen.calibration
-    if own is None:
+    if (own := seen.calibration) is None:
         return None
     off_m, off_rad = own.off_nominal(cell.arm, seen.samples[-1].joints)
     return {"theta_rad": own.theta, "a_m": own.a, "d_m": own.d, "alpha_rad": own.alpha,
