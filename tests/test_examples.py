@@ -66,8 +66,7 @@ def test_the_guides_lines_for_mujoco(tmp_path):
     text = (ROOT / "worker/docs/howto/exchange.md").read_text(encoding="utf-8")
     block, = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     limber.open(shutil.copytree(EXAMPLE, tmp_path / "a.branch")).export(tmp_path / "apple.xml")
-    told = run_here(block, tmp_path)
-    place = [float(part) for part in told.strip("[]\n ").split()]
+    place = np.array(run_here(block, tmp_path).strip("[]\n ").split(), float)
     assert len(place) == 3 and 0.05 < np.linalg.norm(place) < 1
 
 
@@ -78,11 +77,9 @@ def test_the_core_in_ten_lines(tmp_path):
     with patch.object(sys, "argv", ["bend.py", str(folder)]):
         told = run_here((SCRIPTS / "bend.py").read_text(encoding="utf-8"), tmp_path)
     told = re.findall(r"(\d+) mm: (\S+) J, \[(.+)\] N", told)
-    energies = [float(energy) for _, energy, _ in told]
-    forces = [float(np.linalg.norm([float(part) for part in force.split()]))
-              for _, _, force in told]
-    assert [way for way, _, _ in told] == ["5", "10", "15"]
-    assert 0 < energies[0] < energies[1] < energies[2] and 0 < forces[0] < forces[2]
+    ways, energies, *forces = np.array([" ".join(row).split() for row in told], float).T
+    assert ways.tolist() == [5, 10, 15] and 0 < energies[0] < energies[1] < energies[2]
+    assert 0 < np.linalg.norm(forces, axis=0)[0] < np.linalg.norm(forces, axis=0)[2]
     text = (SCRIPTS / "bend.py").read_text().split('"""')[2]
     assert len([line for line in text.splitlines() if line.strip()]) <= 10
 
@@ -169,7 +166,7 @@ def test_headless_estimation(branch_folder, tmp_path):
                     reason="the script is bash's, and needs bpy")
 def test_rendering(tmp_path):
     """A scene, a picture and a turntable whose sides differ."""
-    from PIL import Image
+    from PIL import Image, ImageSequence
 
     folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
     run("bash", SCRIPTS / "render.sh", folder, WIDTH="160", SIDES="2")
@@ -177,11 +174,9 @@ def test_rendering(tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 2000
     with Image.open(tmp_path / "a.webp") as moving:
         assert moving.n_frames == 2 and moving.size == (160, 120)
-        sides = []
-        for number in range(2):
-            moving.seek(number)
-            sides.append(np.asarray(moving.convert("L"), float))
-    assert np.abs(sides[1] - sides[0]).max() > 30
+        first, second = (np.asarray(side.convert("L"), float)
+                         for side in ImageSequence.Iterator(moving))
+    assert np.abs(second - first).max() > 30
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_which_of_both_the_pulls_tell_stands_first():
     one = {"young_interval_pa": [[1e9, 2e9], [1e8, 3e8]],
            "bending_stiffness_interval_nm2": [[1.0, 1.3], [0.1, 0.12]]}
     told = telling_sentence(one)
-    assert "the flexural rigidity E I to within 13 % and Young's modulus E to within a" in told
+    assert "the bending stiffness E I to within 13 % and Young's modulus E to within a" in told
     assert "factor of 1.7: good for plans and forces." in told and "need E I alone" in told
     both = telling_sentence(one | {"bending_stiffness_interval_nm2": [[1.0, 3.0]] * 2})
     assert "Both follow alike" in both and "first plan with a wide margin" in both

@@ -69,4 +69,4 @@ def table_of(records: Iterable[Any], *columns: tuple[Any, ...], missing: str = "
 
 def place_text(place: Iterable[float]) -> str:
     """Return coordinates as an edit of a skeleton takes them."""
-    return " ".join(f"{value:.8g}" for value in place)
+    return " ".join(f"{round(value, 6):.8g}" for value in place)

@@ -542,9 +542,8 @@ def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
             continue
         try:
             found[name] = plan_path(asked, search, engine=engine, progress=part)
-        except NoPathError as error:
-            # Not conclusive: the eikonal planner finds the path, or proves that there is none.
-            progress.warn(f"{name}: {error}")
+        except NoPathError:
+            progress.warn(f"{name} found no path. The eikonal planner finds one, or says why not.")
     return found
 
 

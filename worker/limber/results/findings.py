@@ -62,7 +62,7 @@ def telling_sentence(estimate: Mapping[str, Any]) -> str:
     wide = sorted((max(log(each[1] / each[0]) / 2 if each and all(each) else inf
                        for each in estimate[key]), name)
                   for key, name in (("young_interval_pa", "Young's modulus E"),
-                                    ("bending_stiffness_interval_nm2", "the flexural rigidity E I"))
+                                    ("bending_stiffness_interval_nm2", "the bending stiffness E I"))
                   if estimate.get(key))
     best, worst = wide[0][0], wide[-1][0]
     use = next(use for limit, use in _USES if best <= limit)

@@ -82,8 +82,8 @@ class Prospects:
                                   self._deviation(self._seen_twice())))
         last = self._objective.forwards[-1].name
         found.append(self._result(ANOTHER_PULL, Text(f"like {last}. ", Command("suggest-pull"),
-                                                     " finds one that says "
-                                                     "more"), self.after_another_pull()))
+                                                     " finds a better one"),
+                                  self.after_another_pull()))
         worth = [each for each in found if each["width_share"] < WORTHWHILE]
         return sorted(worth, key=lambda each: each["width_share"])[:count]
 

@@ -342,8 +342,8 @@ def _path_to_root(skeleton: Skeleton, node: int) -> list[int]:
 
 def _circle() -> InputError:
     return InputError("The branch carries the one to which it would be attached.",
-                      "The skeleton would contain a cycle.",
-                      "Give the carried branch as `at`, and the branch that carries it as `to`.")
+                      "The skeleton would contain a cycle.", "Give the carried branch as `at`. Or "
+                      "split, `at` the first node of what hangs wrongly, `to` where it belongs.")
 
 
 def _data(skeleton: Skeleton) -> dict[str, np.ndarray]:

@@ -42,7 +42,7 @@ def true_moduli(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> list[fl
 
 
 def rigidity_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return flexural rigidity E I per control point; none if the shape was not judged."""
+    """Return bending stiffness E I per control point; none if the shape was not judged."""
     if not estimate.get("bending_stiffness_nm2"):
         return []
     return table_of(
@@ -198,7 +198,7 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                      "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
     edits = {"unlikely branch": "confirm, delete", "unresolved radius": "radius",
              "limited radius": "radius, split (two limbs)", "radius jump": "radius, split",
-             "bridged gap": "confirm, bridge", "kink": "move", "starts backwards": "bridge",
+             "bridged gap": "confirm, bridge", "kink": "move, split", "starts backwards": "bridge",
              "attachment": "bridge", "root": "root"}
 
     def uncertainty(part: Mapping[str, Any]) -> str:

@@ -88,7 +88,7 @@ class Estimate(Result):
 
         known = self.file or self.values
         return filled(
-            ("Flexural rigidity (I: mean of the control point's part)",
+            ("Bending stiffness (I: mean of the control point's part)",
              rows_of.rigidity_rows(known)),
             ("Sources of uncertainty: standard deviations",
              rows_of.deviation_rows(known) if "fractions" in known else []),
