@@ -22,6 +22,7 @@ _ALONE = """
 import os
 from limber.robot.driver.real_time import claim_real_time
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not what a test before has left
 print(claim_real_time(), os.sched_getscheduler(0) == os.SCHED_OTHER)
 """
 

@@ -148,3 +148,8 @@ class Words:
             except OSError:
                 # The parent does not listen; the end of the orders shows that it has ended.
                 return
+
+
+if __name__ == "__main__":
+    print(json.dumps({"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
+                      "kept_awake": keep_awake()}))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -165,11 +168,10 @@ def _calibration(cell: Cell, seen: Observed) -> dict[str, Any] | None:
 
 
 def _computer(progress: Progress) -> dict[str, bool]:
-    """Real-time privileges of the loop that moves a robot."""
-    from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
-
-    summary = {"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
-               "kept_awake": keep_awake()}
+    """Real-time privileges of the loop that moves a robot, asked for by a process of its own: a
+    program that runs this command would keep the priority, and its memory locked."""
+    summary = json.loads(subprocess.run([sys.executable, "-m", "limber.robot.driver.real_time"],
+                                        capture_output=True, text=True, check=True).stdout)
     for name, text in (
             ("real_time", "The loop has no real-time priority. Other programs can delay it"),
             ("kept_in_memory", "The driver's memory is not locked (on Linux `ulimit -l`). Memory "
