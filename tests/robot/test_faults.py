@@ -152,9 +152,9 @@ def test_a_controller_that_sends_a_quarter_of_its_samples_moves_as_fast(stepped,
     monkeypatch.setattr(RtdeClient, "is_due", lambda client, controller: (
         controller.step_count % 4 == 0 and usual(client, controller)))
     with RobotLink(cell_for(stepped.address)) as link:
-        assert ["125 samples a second, 500" in text for text in link.warnings] == [True]
-        link.wait_for_samples()
-        link.tare()
+        assert ["125 samples a second, not 500" in text for text in link.warnings] == [True]
+        assert link.facts["rate_hz"] == pytest.approx(125.0)
+        tared(link)
         path, began = straight(stepped, (0.0, 0.05, 0.0)), stepped.now
         assert link.follow(path)["event"] == "reached"
     assert stepped.now - began < path.duration + 0.6

@@ -62,12 +62,12 @@ class Driver:
         self.cell, self.tell = cell, words.tell
         self._control = control_of(cell)
         sensor = open_sensor(cell, self._control)
-        self.guard = guard_of(cell, self._control.rate)
         level = _warm_up(cell, self._control, sensor, self.tell)
+        self.guard = guard_of(cell, self._control.rate)
         # Now: if it has just loaded much, this takes longer than the watchdog would wait.
         self.facts = self._control.facts | {
             "real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
-            "kept_awake": keep_awake()}
+            "kept_awake": keep_awake(), "rate_hz": self._control.rate}
         set_deadline(CONNECT_SECONDS)
         self._control.connect()
         self._deadline = RenewedDeadline()
@@ -345,15 +345,15 @@ def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor,
              tell: Callable[..., None]) -> np.ndarray | None:
     """Run the loop's functions once: loading during a motion would starve the watchdog. Return
     the level of the controller's own sensor, as :meth:`.WrenchChain.level`; ``tell`` if fewer
-    samples come than were asked for."""
+    samples come than were asked for, and reckon with so many."""
     samples: list[Sample] = []
     while len(samples) < LEVEL_READINGS:
         samples += control.read(1.0)
     step = float(np.median(np.diff([sample.clock for sample in samples])))
     if step > 1.5 / control.rate:
-        tell(event="warning", text=f"the controller sends {1.0 / step:.0f} samples a second, "
-             f"{control.rate:.0f} were asked for: a force is noticed up to "
-             f"{1000 * (step - 1.0 / control.rate):.0f} ms later, and the arm moves on meanwhile")
+        tell(event="warning", text=f"the controller sends {1.0 / step:.0f} samples a second, not "
+             f"{control.rate:.0f}: a force is seen {1e3 * (step - 1 // control.rate):.0f} ms later")
+        control.rate = 1.0 / step
     readings = [sensor.read(sample) for sample in samples]
     for sample, reading in zip(samples, readings, strict=True):
         rehearse(cell, sample, reading)
