@@ -152,7 +152,7 @@ def test_a_controller_that_sends_a_quarter_of_its_samples_moves_as_fast(stepped,
     monkeypatch.setattr(RtdeClient, "is_due", lambda client, controller: (
         controller.step_count % 4 == 0 and usual(client, controller)))
     with RobotLink(cell_for(stepped.address)) as link:
-        assert ["125 samples a second, not 500" in text for text in link.warnings] == [True]
+        assert ["not 500: a force is seen 6 ms" in text for text in link.warnings] == [True]
         assert link.facts["rate_hz"] == pytest.approx(125.0)
         tared(link)
         path, began = straight(stepped, (0.0, 0.05, 0.0)), stepped.now

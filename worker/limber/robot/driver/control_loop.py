@@ -352,7 +352,7 @@ def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor,
     step = float(np.median(np.diff([sample.clock for sample in samples])))
     if step > 1.5 / control.rate:
         tell(event="warning", text=f"the controller sends {1.0 / step:.0f} samples a second, not "
-             f"{control.rate:.0f}: a force is seen {1e3 * (step - 1 // control.rate):.0f} ms later")
+             f"{control.rate:.0f}: a force is seen {1e3 * (step - 1 / control.rate):.0f} ms later")
         control.rate = 1.0 / step
     readings = [sensor.read(sample) for sample in samples]
     for sample, reading in zip(samples, readings, strict=True):
