@@ -25,7 +25,7 @@ def _from_files_line(values: Mapping[str, Any]) -> str:
     if not values["offline"]:
         return ""
     plan = values["plan"]
-    return (f"{values['cell_file']} describes a {Path(values['arm']).name}; its base is known to "
+    return (f"{values['cell_file']}: arm {Path(values['arm']).name}; its base is known to "
             f"{1000 * values['base_position_sigma_m']:.1f} mm"
             f"{f', and the arm can follow {plan}' if plan else ''}. No robot was asked.")
 
