@@ -162,11 +162,11 @@ PAGE = """# A
 
 ```{file} say.py
 import sys
-print("said", 6 * 7)
-sys.exit(int(sys.argv[1]))
+print("said", 6 * 7); sys.exit(int(sys.argv[1]))
 ```
 
 ```{run}
+:says: said 43
 python say.py 0
 ```
 
@@ -188,6 +188,6 @@ def test_a_tutorials_commands_run_and_must_end_as_stated(tmp_path):
     done = subprocess.run([sys.executable, "-m", "sphinx", "-q", "-b", "text", tmp_path,
                            tmp_path / "out"], capture_output=True, text=True, check=False)
     shown = (tmp_path / "out" / "index.txt").read_text(encoding="utf-8")
-    assert shown.count("said 42") == 3
+    assert shown.count("said 42") == 3 and "does not say 'said 43'" in done.stderr
     assert "`python say.py 4` ended with exit code 4" in done.stderr
-    assert done.stderr.count("WARNING") == 1
+    assert done.stderr.count("WARNING") == 2

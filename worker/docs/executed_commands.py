@@ -5,7 +5,8 @@ Three directives work in one folder for each page, which begins empty:
 ``{run}``
     Runs its lines with the shell's rules for words and nothing else of a shell: a line begins with
     ``limber`` or ``python``. The page shows the lines and the end of what each printed. The option
-    ``exit`` states the expected exit code (default 0), ``lines`` how many lines are shown.
+    ``exit`` states the expected exit code (default 0), ``lines`` how many lines are shown, ``says``
+    a text that the last line has to print, such as a number that the page states.
 ``{file} NAME``
     Writes its content into the folder, and shows it.
 ``{made} NAME``
@@ -50,8 +51,10 @@ class Run(Directive):
     """Run commands and show what they print."""
 
     has_content = True
+    told = ""
     option_spec: ClassVar[dict[str, Any]] = {
-        "exit": directives.nonnegative_int, "lines": directives.positive_int}
+        "exit": directives.nonnegative_int, "lines": directives.positive_int,
+        "says": directives.unchanged_required}
 
     def run(self) -> list[nodes.Node]:
         """Return a block of the commands, and one of the output of each that prints."""
@@ -66,6 +69,9 @@ class Run(Directive):
             if told:
                 shown.append(nodes.literal_block(told, told, language="text",
                                                  classes=["command-output"]))
+        if _enabled(env) and (asked := self.options.get("says", "")) not in self.told:
+            LOG.warning("`%s` does not say %r:\n%s", line, asked, self.told[-1500:],
+                        location=(env.docname, self.lineno))
         return shown
 
     def _output_of(self, env: Any, line: str) -> str:
@@ -83,6 +89,7 @@ class Run(Directive):
         if done.returncode != self.options.get("exit", 0):
             LOG.warning("`%s` ended with exit code %d:\n%s", line, done.returncode, text[-1500:],
                         location=(env.docname, self.lineno))
+        self.told = text
         lines = text.splitlines()
         kept = self.options.get("lines", 14)
         return "\n".join(lines if len(lines) <= kept else ["...", *lines[-kept:]])
