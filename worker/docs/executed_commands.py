@@ -85,7 +85,7 @@ class Run(Directive):
         except subprocess.TimeoutExpired:
             LOG.warning("`%s` takes over %d s", line, SECONDS, location=(env.docname, self.lineno))
             return ""
-        text = (done.stdout + done.stderr).replace(f"{folder}{os.sep}", "").rstrip()
+        text = (done.stderr + done.stdout).replace(f"{folder}{os.sep}", "").rstrip()
         if done.returncode != self.options.get("exit", 0):
             LOG.warning("`%s` ended with exit code %d:\n%s", line, done.returncode, text[-1500:],
                         location=(env.docname, self.lineno))
