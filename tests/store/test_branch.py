@@ -97,6 +97,13 @@ def test_damaged_file_is_named(branch: Branch):
         Branch.open(branch.folder, verify=True)
 
 
+def test_gravity_that_is_no_vector_is_refused(branch: Branch):
+    with branch.stage("mesh", {}) as stage:
+        stage.result["gravity_m_s2"] = False
+    with pytest.raises(InputError, match="gravity"):
+        _ = Branch.open(branch.folder).gravity
+
+
 def test_damaged_file_stops_its_readers_but_not_its_maker(branch: Branch):
     """A damaged file cannot be read or built on; the stage that makes it puts things right."""
     branch.path("data.txt").write_text("eno")

@@ -29,6 +29,7 @@ from pydantic import BaseModel
 from limber.core.constants import GRAVITY
 from limber.core.errors import BranchFolderError, Command, Option
 from limber.core.files.atomic import file_digest, owned_name, sweep
+from limber.core.files.reading import checked_as
 from limber.core.json_values import plain, stored
 from limber.store import journal
 from limber.store.disk_errors import gone, in_words, require_room, require_there
@@ -130,7 +131,8 @@ class Branch:
     @property
     def gravity(self) -> tuple[float, float, float]:
         """Gravity [m/s^2] in the branch's frame; the upright rotation of a scan rotates it too."""
-        return tuple(self.made.result.get("gravity_m_s2", GRAVITY)) if self.made else GRAVITY
+        found = self.made.result.get("gravity_m_s2", GRAVITY) if self.made else GRAVITY
+        return checked_as(self.folder / MANIFEST, tuple[float, float, float], found, "gravity")
 
     @property
     def made(self) -> StageEntry | None:
