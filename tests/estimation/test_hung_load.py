@@ -237,7 +237,8 @@ def test_the_guides_beam_has_the_moduli_that_others_found(tmp_path, monkeypatch,
         Path(name).write_text(text)
     exec(Path("draw.py").read_text())
     told = {}
-    for line in re.search(r"```\{run\}\n(.*?)```", page, re.DOTALL)[1].splitlines()[1:]:
+    blocks = "".join(re.findall(r"```\{run\}\n(.*?)```", page, re.DOTALL))
+    for line in re.findall(r"^limber .*$", blocks, re.MULTILINE):
         words = line.replace("../../../../tests/data/silicone_beam", str(BEAM)).split()[1:]
         assert call([*words, "--json", "--progress", "none"]) == 0
         told[words[0]] = last_line(capsys)

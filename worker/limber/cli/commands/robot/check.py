@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from limber.cli.cell_tool import CellTool
 from limber.core.errors import InputError, Option, Text, WorkError
+from limber.core.files.reading import json_content
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, given, option
 
@@ -170,8 +170,9 @@ def _calibration(cell: Cell, seen: Observed) -> dict[str, Any] | None:
 def _computer(progress: Progress) -> dict[str, bool]:
     """Real-time privileges of the loop that moves a robot, asked for by a process of its own: a
     program that runs this command would keep the priority, and its memory locked."""
-    summary = json.loads(subprocess.run([sys.executable, "-m", "limber.robot.driver.real_time"],
-                                        capture_output=True, text=True, check=True).stdout)
+    told = subprocess.run([sys.executable, "-m", "limber.robot.driver.real_time"],
+                          capture_output=True, text=True, check=True).stdout
+    summary = json_content(told, "the loop's process", "its privileges")
     for name, text in (
             ("real_time", "The loop has no real-time priority. Other programs can delay it"),
             ("kept_in_memory", "The driver's memory is not locked (on Linux `ulimit -l`). Memory "
