@@ -28,9 +28,9 @@ def test_intervals_hold_where_two_stations_face_each_other() -> None:
 def test_sums_over_points_are_those_of_whole_arrays() -> None:
     """The mixture's plain form: all points, stations and places of a side at once."""
     rng = np.random.default_rng(7)
-    count, stations = 40, 3
-    axis, towards = (each / np.linalg.norm(each, axis=1)[:, None]
-                     for each in (rng.normal(size=(count, 3)), rng.normal(size=(stations, 3))))
+    count, stations, turn = 40, 3, 2.4 * np.arange(40)  # all 45 degrees or more off a sight
+    axis = np.column_stack([np.cos(turn), np.sin(turn), np.ones(count)]) / np.sqrt(2)
+    towards = np.array([[1.0, 0.0, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
     radius, offset = rng.uniform(2e-3, 8e-3, count), 5e-3 * rng.normal(size=(count, 3))
     shift, share = 1e-4 * rng.normal(size=(stations, 3)), np.array([0.5, 0.3, 0.2])
     noise, wider, fit = np.array([5e-4, 9e-4]), 1e-4, 1e-3
@@ -64,10 +64,10 @@ def test_sums_over_points_are_those_of_whole_arrays() -> None:
 
 
 def test_flatness_is_that_of_whole_arrays() -> None:
-    rng = np.random.default_rng(8)
-    axis, views = (each / np.linalg.norm(each, axis=1)[:, None]
-                   for each in (rng.normal(size=(30, 3)), rng.normal(size=(6, 3))))
-    offset = rng.normal(size=(30, 3))
+    turn = 2.4 * np.arange(30)
+    axis = np.column_stack([np.cos(turn), np.sin(turn), np.ones(30)]) / np.sqrt(2)
+    views = np.vstack([np.eye(3), [[0.6, 0.8, 0.0], [0.8, -0.6, 0.0], [-0.6, 0.8, 0.0]]])
+    offset = np.column_stack([np.sin(3 * turn), np.cos(5 * turn), np.sin(turn + 1)])
     along = views[:, None] - (views @ axis.T)[:, :, None] * axis
     along /= np.linalg.norm(along, axis=2)[:, :, None]
     on = np.einsum("kij,ij->ki", along, offset)**2
