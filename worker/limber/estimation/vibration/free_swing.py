@@ -25,6 +25,7 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.uncertainty.creep import LIKELIER, TIME_SHARES, creep_sentence
 from limber.estimation.uncertainty.model_error import MeshStiffness, mesh_error
+from limber.estimation.vibration.ringing import repetition
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.dynamics.motion import NewmarkSettings, lowest_modes
@@ -338,7 +339,7 @@ class _Swing:
 
     def scale_to(self, period: float, released: float) -> None:
         """Estimate the modulus from the period, and damping from the decay of the swing."""
-        frequency = self.frequency(self.model, RayleighDamping(0.0, 0.0))
+        frequency = self.frequency(self.model)
         self.factor0 = (1 / period / frequency) ** 2
         self.omega, self.period = 2 * np.pi / period, period
         after = self.seen.times > released
@@ -362,20 +363,15 @@ class _Swing:
                            (model.young / level)[:, None], np.array([level]))
         return found or MeshStiffness(np.ones(1), np.zeros(1))
 
-    def frequency(self, model: BranchModel, damping: RayleighDamping) -> float:
+    def frequency(self, model: BranchModel) -> float:
         """Return the first frequency about the equilibrium [Hz]."""
-        from limber.mechanics.statics.solve import solve_static
-
-        model = model.with_parameters(damping=damping)
-        is_held = self.seen.start != "loaded" and self.load.any()
-        rest = solve_static(model, grasp=self.grasp if is_held else None,
-                            grasp_force=self.load if is_held else None).require()
-        tangent = model.equations().tangent(model, rest.displacement)
-        mode = np.random.default_rng(0).normal(size=rest.displacement.shape)
+        rest = self._ends(model).end
+        tangent, mode = model.equations().tangent(model, rest), np.random.default_rng(0).normal(
+            size=rest.shape)
         for _ in range(25):
             mode = tangent.solve(model.mass_times(mode))
             mode /= np.linalg.norm(mode)
-        stiffness = float((mode * model.tangent_times(rest.displacement, mode)).sum())
+        stiffness = float((mode * model.tangent_times(rest, mode)).sum())
         return float(np.sqrt(stiffness / (mode * model.mass_times(mode)).sum()) / (2 * np.pi))
 
     def use_modes(self) -> None:
@@ -553,7 +549,7 @@ class _Swing:
         cov = np.linalg.inv(information)
         wide = 1.96 * np.sqrt(np.diag(cov))
         best = self.with_values(free)
-        frequency = self.frequency(best, best.damping)
+        frequency = self.frequency(best)
         omega = 2 * np.pi * frequency
         parts = np.array([best.damping.mass / (2 * omega), best.damping.stiffness * omega / 2])
         ratio = float(parts.sum())
@@ -594,15 +590,9 @@ def _correlated(left: np.ndarray) -> float:
     """Return the number of readings that count as one: the sum of the residual's autocorrelation.
     Over time, and over markers and axes, which all follow the same motion."""
     flat = np.nan_to_num(left.reshape(len(left), -1))
-    power = float((flat**2).sum())
-    if power == 0:
+    if not flat.any():
         return 1.0
-    total = 1.0
-    for lag in range(1, len(flat) // 2):
-        value = float((flat[lag:] * flat[:-lag]).sum()) / power
-        if value < 0.05:
-            break
-        total += 2 * value
+    total = repetition(flat, len(flat) // 2)
     # Axes and markers that move together count as one: the participation of the principal ones.
     values = np.linalg.eigvalsh(flat.T @ flat)
     together = flat.shape[1] * float((values**2).sum()) / float(values.sum()) ** 2

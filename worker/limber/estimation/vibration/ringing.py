@@ -529,7 +529,7 @@ def _judged(free: np.ndarray, times: np.ndarray, channels: np.ndarray, power: fl
                         - _left(free - step * one, times, channels)).ravel() / (2 * step)
                        for one in np.eye(len(free))], axis=1)
     spare = max(left.size - len(free) * (1 + channels.shape[1]), 1)
-    variance = float((left**2).sum()) / spare * _stretch(left)
+    variance = float((left**2).sum()) / spare * repetition(left, len(left) // 4)
     deviation = np.sqrt(np.diag(variance * np.linalg.pinv(slopes.T @ slopes)))
     basis, count = _basis(free, times), len(free) // 2
     amplitude = np.linalg.lstsq(basis, channels, rcond=None)[0]
@@ -579,10 +579,11 @@ def _peak(times: np.ndarray, channels: np.ndarray, step: float) -> float:
     return float(frequencies[inside][np.argmax(power[inside])])
 
 
-def _stretch(left: np.ndarray) -> float:
-    """Number of readings that count as one, from the autocorrelation of the residual."""
+def repetition(left: np.ndarray, most: int) -> float:
+    """Number of readings in a row [n, c] that count as one, from their autocorrelation over lags
+    below ``most``."""
     power, total = float((left**2).sum()), 1.0
-    for lag in range(1, len(left) // 4):
+    for lag in range(1, most):
         value = float((left[lag:] * left[:-lag]).sum()) / max(power, 1e-300)
         if value < 0.05:
             break
