@@ -1,6 +1,7 @@
 """The online estimator: corrected by the full model, honest without it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,16 @@ from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import TrainingSettings
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+def here(full):
+    """The full model in this process: each result is there when the call returns."""
+    def answer(ask):
+        return lambda *asked: (value := ask(*asked), SimpleNamespace(
+            done=lambda: True, exception=lambda: None, result=lambda: value))[1]
+
+    solver = filter.ExactSolver(full)
+    return SimpleNamespace(frame=answer(solver.frame), basis=answer(solver.basis))
 
 
 @pytest.fixture(autouse=True)
@@ -44,10 +55,9 @@ def full(bench, pull):
 
 
 def reduced_around(full, young, spread):
-    here = filter.Here(full)._solver
-    model = full.model(young)
+    grasp, model = filter.ExactSolver(full).grasp, full.model(young)
     training = TrainingSettings(grasp_count=20, young_spread=spread)
-    return build_reduced(model, here.grasp, full.weights, young,
+    return build_reduced(model, grasp, full.weights, young,
                          ReducedSettings(size=40, training=training))[0]
 
 
@@ -73,7 +83,7 @@ def test_it_ends_where_all_frames_together_do(bench, pull, batch, full):
     reduced = reduced_around(full, 1.2 * TRUTH, 1.5)
     alone, _ = followed(reduced, full, pull, None)
     alone.settle()
-    estimator, states = followed(reduced, full, pull, filter.Here(full))
+    estimator, states = followed(reduced, full, pull, here(full))
     end = estimator.settle()
     deviation = np.sqrt(np.diag(estimator.covariance))
     off, off_alone = (np.abs(np.log(found / batch)) for found in (end.young, alone.young))
@@ -86,7 +96,7 @@ def test_it_ends_where_all_frames_together_do(bench, pull, batch, full):
 @pytest.mark.slow
 def test_a_basis_for_other_moduli_is_made_on_the_way(bench, pull, batch, full):
     """Begun a factor of three too stiff, outside of what the training sampled."""
-    estimator, _ = followed(reduced_around(full, 3 * TRUTH, 1.3), full, pull, filter.Here(full))
+    estimator, _ = followed(reduced_around(full, 3 * TRUTH, 1.3), full, pull, here(full))
     estimator.settle()
     assert estimator.refresh_count >= 1
     deviation = np.sqrt(np.diag(estimator.covariance))
@@ -99,7 +109,7 @@ def test_more_of_the_same_is_called_idle_and_little_noise_enough(bench, pull, fu
     known to 2 %, which another pull could not improve by more than that.
     """
     reduced = reduced_around(full, TRUTH, 1.5)
-    _, states = followed(reduced, full, pull, filter.Here(full))
+    _, states = followed(reduced, full, pull, here(full))
     assert not states[-1].enough and not any(state.idle for state in states)
     quiet = pull.entry.model_copy(update={"sensor": pull.entry.sensor.model_copy(update={
         "position_sigma_m": 2e-5, "force_sigma_n": 1e-4 * pull.entry.sensor.force_sigma_n})})

@@ -13,6 +13,7 @@ frames, and does not average out as noise does.
 import time
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -131,10 +132,10 @@ class Beside:
                           name="the full model beside an online estimate")
 
     def frame(self, *arguments: np.ndarray) -> "Future[ExactFrame | None]":
-        return self._pool.submit(_frame, *arguments)
+        return self._pool.submit(_asked, "frame", *arguments)
 
     def basis(self, *arguments: np.ndarray) -> "Future[ReducedModel]":
-        return self._pool.submit(_basis, *arguments)
+        return self._pool.submit(_asked, "basis", *arguments)
 
     def close(self) -> None:
         self._pool.close()
@@ -146,28 +147,6 @@ class Beside:
         self.close()
 
 
-class Here:
-    """The same in this process: the result is available when the call returns."""
-
-    def __init__(self, branch: FullBranch):
-        self._solver = ExactSolver(branch)
-
-    def frame(self, *arguments: np.ndarray) -> "Future[ExactFrame | None]":
-        return _done(self._solver.frame(*arguments))
-
-    def basis(self, *arguments: np.ndarray) -> "Future[ReducedModel]":
-        return _done(self._solver.basis(*arguments))
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-def _done(value: object) -> Future:
-    future: Future = Future()
-    future.set_result(value)
-    return future
-
-
 _solver: list[ExactSolver] = []
 
 
@@ -175,12 +154,8 @@ def _begin(branch: FullBranch) -> None:
     _solver[:] = [ExactSolver(branch)]
 
 
-def _frame(*arguments: np.ndarray) -> ExactFrame | None:
-    return _solver[0].frame(*arguments)
-
-
-def _basis(*arguments: np.ndarray) -> ReducedModel:
-    return _solver[0].basis(*arguments)
+def _asked(name: str, *arguments: np.ndarray) -> Any:
+    return getattr(_solver[0], name)(*arguments)
 
 
 # Information of the frames of a pull on the moduli: linearised and summed.
@@ -400,7 +375,7 @@ class OnlineEstimator:
     def __init__(self, reduced: ReducedModel, entry: GraspEntry, mesh: TetMesh,
                  rest_points: np.ndarray, *, position_sigma: float, force_sigma: float,
                  prior_deviation: float = 2.0, kept_count: int = 64,
-                 exact: Beside | Here | None = None):
+                 exact: Beside | None = None):
         self._entry, self._mesh = entry, mesh
         self.rest_points = np.asarray(rest_points, float)
         self._use(reduced)

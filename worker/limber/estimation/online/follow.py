@@ -19,7 +19,6 @@ from limber.estimation.forward.forward_model import under_its_weight
 from limber.estimation.online.filter import (
     Beside,
     FullBranch,
-    Here,
     OnlineEstimator,
     OnlineFrame,
     OnlineState,
@@ -146,7 +145,7 @@ class Begun:
     pull: Pull
     prior_deviation: float
 
-    def estimator(self, exact: Beside | Here | None) -> OnlineEstimator:
+    def estimator(self, exact: Beside | None) -> OnlineEstimator:
         """Return the estimator that processes the frames."""
         # A full collection would visit all objects of all imported libraries during a frame.
         gc.collect()
