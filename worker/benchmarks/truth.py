@@ -224,18 +224,14 @@ def _widths(interval: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
     return np.diff(np.log(interval), axis=1)[:, 0] / 2
 
 
-def _one_pull(setting: Setting) -> list[Row]:
-    return _cell_rows(setting, _ONE_PULL, 1, setting.at_most(60, 4), CalibrationEntry(), 1)
-
-
-def _three_pulls(setting: Setting) -> list[Row]:
-    return _cell_rows(setting, _THREE_PULLS, 2, setting.at_most(20, 2), _CALIBRATED, 3)
-
-
 PARTS = {
-    "one-pull": Part(_one_pull, 60, _ONE_PULL, grows=True),
+    "one-pull": Part(lambda setting: _cell_rows(
+        setting, _ONE_PULL, 1, setting.at_most(60, 4), CalibrationEntry(), 1), 60, _ONE_PULL,
+        grows=True),
     "scans": Part(scan_loops.loop_rows, 60, scan_loops.ROWS, grows=True),
-    "three-pulls": Part(_three_pulls, 150, _THREE_PULLS, grows=True),
+    "three-pulls": Part(lambda setting: _cell_rows(
+        setting, _THREE_PULLS, 2, setting.at_most(20, 2), _CALIBRATED, 3), 150, _THREE_PULLS,
+        grows=True),
     "starts": Part(_start_row, 20, (_START,), grows=True),
     "advice": Part(_advice_row, 30, (_ADVICE,), grows=True),
     "beam": Part(silicone_beam.beam_rows, 60, silicone_beam.BEAM_ROWS),
