@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares, minimize
+from tests.subjects.forced_pulls import by_differences
 
 from benchmarks.paper_branches import Bench, PaperBranch
 from limber.core.errors import InputError
@@ -34,12 +35,8 @@ def test_shares_are_the_derivatives_of_the_field(field):
     extra = field.names
     space = ParameterSpace(Values(TRUTH, 0.35, 900.0), (0, 1, 2, 3), extra)
     free = np.r_[np.log(TRUTH), 0.5 * rng.standard_normal(len(extra))]
-    exact = field.shares(space.unpack(free), extra)
-    for column in range(len(free)):
-        step = np.zeros(len(free))
-        step[column] = 1e-5
-        ahead, behind = (np.log(field.young(space.unpack(free + sign * step))) for sign in (1, -1))
-        assert (ahead - behind) / 2e-5 == pytest.approx(exact[column], abs=1e-7)
+    slopes = by_differences(lambda each: np.log(field.young(space.unpack(each))), free, 1e-5)
+    assert slopes.T == pytest.approx(field.shares(space.unpack(free), extra), abs=1e-7)
 
 
 def test_any_form_keeps_the_moduli_at_the_control_points(field, small_bench):

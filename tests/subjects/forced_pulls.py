@@ -23,3 +23,14 @@ def with_force(pull: Pull, change) -> Pull:
     wrenches = pull.wrenches.copy()
     wrenches[:, :3] = change(wrenches[:, :3])
     return replace(pull, wrenches=wrenches)
+
+
+def by_differences(values, free: np.ndarray, step: float) -> np.ndarray:
+    """Slopes [r, p] of values [r] of a free vector [p] by central differences."""
+    return np.column_stack([(values(free + each) - values(free - each)) / (2 * step)
+                            for each in step * np.eye(len(free))])
+
+
+def residual_slopes(objective, free: np.ndarray, step: float) -> np.ndarray:
+    """Slopes [r, p] of an objective's residuals by central differences."""
+    return by_differences(lambda each: objective.evaluate(each).residual, free, step)
