@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from limber.cli.main import call
 from limber.core.errors import InputError
+from limber.estimation.forward.observed_path import seen_at
 from limber.mechanics.model import BranchModel
-from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.hung_load import settled
 from limber.recordings.import_request import read_nominal, register
@@ -39,8 +39,7 @@ class Rig:
                             gravity=(0.0, 0.0, -9.80665))
         grasp = grasp_on(self.mesh, GraspEntry(point_m=self.grasp, radius_m=0.01, mode="point"))
         state = solve_static(model, grasp=grasp, grasp_force=(0.0, 0.0, -weight)).require()
-        operator = point_operator(self.mesh, self.nominal)
-        return (operator @ state.displacement.ravel()).reshape(-1, 3)
+        return seen_at(self.nominal, self.mesh, [state.displacement])[0] - self.nominal
 
     def recording(self, weight: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Times and markers in a turned capture frame: still, dropped, swinging, settled."""

@@ -55,8 +55,8 @@ def test_elimination_equals_the_effective_variance(small_bench, noisy):
     rows, _ = objective._residuals[0].rows(evaluation.pulls[0])
     points = evaluation.pulls[0].positions.size
     sigma = noisy.entry.sensor.position_sigma_m
-    through = forward.response.points.reshape(points, -1) / sigma
-    readings = forward.response.wrenches.reshape(-1, through.shape[1])
+    through = forward.response.positions.reshape(points, -1) / sigma
+    readings = forward.response.forces.reshape(-1, through.shape[1])
     prior = np.linalg.inv(readings.T @ readings) * noisy.entry.sensor.force_sigma_n**2
     # Of the course, the readings leave their best guess; where it starts.
     guess = np.linalg.lstsq(readings, -rows[points:] * noisy.entry.sensor.force_sigma_n,

@@ -16,7 +16,7 @@ from limber.estimation.fitting import nuisances
 from limber.estimation.fitting.initial_modulus import far_points, fitted_frame, put_right
 from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward import solved_pull
-from limber.estimation.forward.forward_model import PointDirections
+from limber.estimation.forward.forward_model import PointDirections, Simulated
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import FitSpec, PullSpec
@@ -102,14 +102,14 @@ def test_slopes_by_adjoints_are_those_of_the_pull(small_bench, bad_cell):
     forward = objective_of(small_bench, bad_cell).forwards[0]
     values, step = Values(TRUTH, 0.36, 900.0), 1e-3
     found = forward.simulate(values, ("poisson",), True)
-    assert found.d_positions.shape[-1] == 5
+    assert found.slopes.positions.shape[-1] == 5
     for column, changed in ((1, replace(values, young=TRUTH * np.exp([0, step, 0, 0]))),
                             (4, replace(values, poisson=0.36 + step))):
         forward._drives_for = changed  # at the same force
         moved = forward.simulate(changed, ("poisson",), False)
         for name in ("positions", "grasps"):
             change = (getattr(moved, name) - getattr(found, name)) / step
-            slope = getattr(found, f"d_{name}")[..., column]
+            slope = getattr(found.slopes, name)[..., column]
             assert np.abs(change - slope).max() < 0.01 * np.abs(slope).max()
         forward._drives_for = values
         forward.simulate(values, ("poisson",), False)
@@ -242,9 +242,9 @@ def test_pulls_of_one_cell_turn_about_one_point(small_bench, small_pull):
     objective = small_bench.objective(pulls, SETTINGS)
     for number, pull in enumerate(pulls):
         places = objective.forwards[number].frames.positions
-        slopes = objective.cell_errors.slopes(number, places, np.zeros((len(places), 3)))
+        slopes = objective.cell_errors.slopes(number, Simulated(places, np.zeros((len(places), 3))))
         wanted = np.cross(turn, places - objective.forwards[0].rest_points.mean(axis=0))
-        assert slopes.points @ (turn / 1e-3) == pytest.approx(wanted, abs=1e-9), pull.name
+        assert slopes.positions @ (turn / 1e-3) == pytest.approx(wanted, abs=1e-9), pull.name
 
 
 def test_an_untared_zero_is_free(small_bench, small, small_pull):
@@ -423,7 +423,7 @@ def test_a_point_aside_of_the_axis_turns_with_the_branch():
     directions = np.concatenate([directions, directions[:, :, [1, 0, 2]]], axis=1)
     pull = nuisances._Pull(None, None, np.zeros(3), np.zeros(3), None, directions,
                            np.zeros((5, 2, 3)), None)
-    arms = nuisances._across(pull)["points"].reshape(5, 2, 3, 2, 2)
+    arms = nuisances._across(pull)["positions"].reshape(5, 2, 3, 2, 2)
     assert not arms[:, 0, :, 1].any() and not arms[:, 1, :, 0].any()
     for point in range(2):
         own = arms[:, point, :, point]

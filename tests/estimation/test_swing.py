@@ -8,6 +8,7 @@ import pytest
 from tests.subjects.meshes import box_mesh
 
 from limber.core.errors import InputError
+from limber.estimation.forward.observed_path import seen_at
 from limber.estimation.vibration.free_swing import (
     Ends,
     ModalSwing,
@@ -47,7 +48,6 @@ def virtual_swing(start):
     gravity = GRAVITY if start == "held" else None
     model = BranchModel(mesh, young=YOUNG, poisson=0.4, density=DENSITY, gravity=gravity,
                         damping=DAMPING)
-    operator = point_operator(mesh, MARKERS)
     times, release, fine = np.arange(110) / 100.0, 0.2034, 0.002
     if start == "held":
         model = model.with_point_masses([
@@ -57,8 +57,7 @@ def virtual_swing(start):
         begin = solve_static(model, grasp=end, grasp_force=[-2 * LOAD, 0, 0]).require()
     run = simulate_dynamics(model, times=fine * np.arange(460), start=begin,
                             settings=EnergyMomentumSettings(max_step=fine))
-    track = (operator @ run.require().displacement.reshape(len(run.times), -1).T).T.reshape(
-        -1, 3, 3)
+    track = seen_at(MARKERS, mesh, run.require().displacement) - MARKERS
     since = np.clip(times - release, 0, None)
     moved = np.stack([np.interp(since, run.times, column) for column in
                       track.reshape(len(track), -1).T], axis=1).reshape(-1, 3, 3)

@@ -127,11 +127,11 @@ def test_forward_derivatives_under_weight(scanned, pull):
                    for sign in (1, -1)]
         ahead, behind = (forward.simulate(each, (), False) for each in changed)
         slope = (ahead.positions - behind.positions) / (2 * step)
-        size = np.abs(found.d_positions).max()
-        assert np.abs(found.d_positions[..., column] - slope).max() < 5e-3 * size
+        size = np.abs(found.slopes.positions).max()
+        assert np.abs(found.slopes.positions[..., column] - slope).max() < 5e-3 * size
         slope = (ahead.forces - behind.forces) / (2 * step)
-        assert np.abs(found.d_forces[..., column] - slope).max() < 5e-3 * np.abs(
-            found.d_forces).max()
+        assert np.abs(found.slopes.forces[..., column] - slope).max() < 5e-3 * np.abs(
+            found.slopes.forces).max()
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import Estimate, judge_model, require_result
 from limber.estimation.fitting.objective import EvaluationLog, Objective
-from limber.estimation.forward.observed_path import MotionWanted, moved
+from limber.estimation.forward.observed_path import MotionWanted, moved, seen_at
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values, open_field
 from limber.estimation.settings import FitSpec
@@ -34,7 +34,6 @@ from limber.geometry.skeleton.skeleton import control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials.materials import young_weights
 from limber.mechanics.model import BranchModel
-from limber.mechanics.points import point_operator
 from limber.recordings.recording import (
     CalibrationEntry,
     GraspEntry,
@@ -147,9 +146,7 @@ def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0,
         travel=choice.reach * choice.fraction * branch.length, turn=turn, phase=choice.phase,
         times=states, weight=np.zeros(3)))
     points = marked_points(skeleton, FRACTIONS, shifts)
-    operator = point_operator(mesh, points)
-    seen = np.array([points + (operator @ each.ravel()).reshape(-1, 3)
-                     for each in made.displacements])
+    seen = seen_at(points, mesh, made.displacements)
     times = np.linspace(0.0, 6.0, FRAMES)
     poses, wrenches, positions = (CubicSpline(states, values)(times)
                                   for values in (made.poses, made.wrenches, seen))

@@ -20,6 +20,7 @@ from limber.core.progress import SILENT
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_pulls
 from limber.estimation.fit_assessment import Estimate
+from limber.estimation.forward.observed_path import seen_at
 from limber.estimation.online.filter import Beside, OnlineFrame
 from limber.estimation.online.follow import begin
 from limber.estimation.parameters import Values
@@ -187,7 +188,7 @@ def _depth_rows(setting: Setting) -> list[Row]:
             write_depth_frames(Path(folder), truth, pull, states, settings)
             seen, _ = observe(Path(folder), pull, truth.skeleton, FRACTIONS)
         bench = Bench(branch)
-        true_points = np.array([truth.control_points + moved for moved in _moved(truth, states)])
+        true_points = seen_at(truth.control_points, truth.mesh, states)
         off = seen.positions - true_points
         sizes.append(np.nanmedian(np.linalg.norm(off, axis=2)))
         squares.append(np.nanmean(np.einsum("fmi,fmij,fmj->fm", off,
@@ -202,13 +203,6 @@ def _depth_rows(setting: Setting) -> list[Row]:
                 f"{np.sqrt(np.mean(squares)):.1f} of their stated deviation; "
                 f"{sum(covered)} of {len(covered)} intervals hold)",
                 max(worst.values()) <= 0.10, len(worst))]
-
-
-def _moved(truth: object, displacements: list) -> list[np.ndarray]:
-    from limber.mechanics.points import point_operator
-
-    operator = point_operator(truth.mesh, truth.control_points)
-    return [(operator @ displacement.ravel()).reshape(-1, 3) for displacement in displacements]
 
 
 def speed_rows(setting: Setting) -> list[Row]:

@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import column
+from limber.estimation.forward.observed_path import seen_at
 from limber.estimation.settings import FitSpec
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh, mark
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.time_series import Stream, write_stream
 from limber.stages.moduli.estimate import EstimateYoung
@@ -156,11 +156,8 @@ def simulated_recording(path: Path, young: float, load: float, seed: int) -> flo
     released after 0.4 s and swings.
     """
     rng = np.random.default_rng(seed)
-    mesh = box_mesh((16, 5, 5))
-    model = BranchModel(mesh, young=young, poisson=POISSON, density=DENSITY, gravity=GRAVITY)
-    state = solve_static(model, grasp=edge_load(mesh), grasp_force=(0.0, 0.0, -load)).require()
     placed = NOMINAL_M + rng.uniform(-1e-3, 1e-3, NOMINAL_M.shape) / np.sqrt(3)
-    moved = (point_operator(mesh, placed) @ state.displacement.ravel()).reshape(-1, 3)
+    moved = _bent(placed, young, load, POISSON, (16, 5, 5))
     times = np.arange(600) / 100.0
     since = np.maximum(times - 0.4, 0.0)
     part = np.where(times > 0.4, 1 - np.exp(-2.2 * since) * np.cos(18 * since), 0.0)
@@ -204,11 +201,16 @@ def edge_load(mesh: TetMesh) -> Grasp:
 def drop(young: float, load: float, *, poisson: float = POISSON,
          cells: tuple[int, int, int] = (12, 4, 4)) -> float:
     """Static drop of the tip markers [m] under a load [N], on bricks of ``cells`` cut into six."""
+    return -float(_bent(NOMINAL_M[TIPS], young, load, poisson, cells)[:, 2].mean())
+
+
+def _bent(points: np.ndarray, young: float, load: float, poisson: float,
+          cells: tuple[int, int, int]) -> np.ndarray:
+    """Displacements [m, 3] [m] of points of the beam under a load [N]."""
     mesh = box_mesh(cells)
     model = BranchModel(mesh, young=young, poisson=poisson, density=DENSITY, gravity=GRAVITY)
     state = solve_static(model, grasp=edge_load(mesh), grasp_force=(0.0, 0.0, -load)).require()
-    operator = point_operator(mesh, NOMINAL_M[:3])
-    return -float((operator @ state.displacement.ravel()).reshape(-1, 3)[:, 2].mean())
+    return seen_at(points, mesh, [state.displacement])[0] - points
 
 
 def recording_rows(_setting: Setting) -> list[Row]:

@@ -53,7 +53,7 @@ from limber.estimation.fitting.optimise import (
     nelder_mead,
 )
 from limber.estimation.forward.forward_model import Forward, under_its_weight
-from limber.estimation.forward.observed_path import is_path_observed
+from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, Values, bump_deviations, hats, stations_of
 from limber.estimation.settings import FitSpec
@@ -215,8 +215,9 @@ class _Strategy:
         for rounds_left in reversed(range(ROUNDS)):
             if shifts:
                 forwards = forwards_of(self.pulls, self.subject, self.settings, shifts)
-            for forward in filter(is_path_observed, forwards if beams else ()):
-                forward.begin_without(begun.zeros.get(forward.name, np.zeros(3)))
+            for forward in forwards if beams else ():
+                if isinstance(forward, ObservedPathForward):
+                    forward.begin_without(begun.zeros.get(forward.name, np.zeros(3)))
             _begin_at(forwards, known)
             objective = Objective(
                 forwards, parameter_space(self.subject, forwards, self.settings), log=log,
@@ -313,7 +314,8 @@ def _standing(objective: Objective, start: Values, scaled: Values | None, progre
 def _require_stable(objective: Objective, values: Values) -> None:
     """Refuse to drive pulls by a force under which the observed states are unstable."""
     names = [forward.name for forward in objective.forwards
-             if is_path_observed(forward) and forward.is_held_against_its_force(values)]
+             if isinstance(forward, ObservedPathForward)
+             and forward.is_held_against_its_force(values)]
     if names:
         raise _ForceLeadsNowhereError(
             f"{', '.join(names)}: the clamping gripper holds the branch in states that are "

@@ -20,11 +20,10 @@ from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.forward.observed_path import MotionWanted, moved
+from limber.estimation.forward.observed_path import MotionWanted, moved, seen_at
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.mechanics.model import BranchModel
-from limber.mechanics.points import point_operator
 from limber.mechanics.strain import strain_state
 from limber.recordings.recording import (
     CalibrationEntry,
@@ -302,8 +301,6 @@ def _without_noise(choice: PullChoice, subject: Subject, values: Values, cell: C
     made = moved(model, grasp, MotionWanted(
         kind="pull", point=point, axis=point - skeleton.nodes[0], travel=choice.reach * arc,
         turn=0.0, phase=choice.phase, times=times, weight=np.zeros(3)))
-    operator = point_operator(subject.mesh, subject.control_points)
-    seen = np.array([subject.control_points + (operator @ u.ravel()).reshape(-1, 3)
-                     for u in made.displacements])
+    seen = seen_at(subject.control_points, subject.mesh, made.displacements)
     return (Pull("suggested", entry, times, made.poses, made.wrenches,
                  Observations(times, seen)), made.displacements)

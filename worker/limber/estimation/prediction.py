@@ -54,7 +54,7 @@ def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down
                         "The load may be far more than the branch can carry.",
                         "Check the unit of the load.")
     moved = found.positions[0] - forward.rest_points
-    slopes = present(found.d_positions, "derivative of the rest")[0]
+    slopes = present(found.slopes, "derivative of the rest").positions[0]
     drop, sigma, drop_sigma = _uncertain(moved, slopes, down, space, known)
     grasp = forward.grasp
     held = grasp.weights @ forward.displacements()[0][grasp.nodes]

@@ -18,7 +18,7 @@ from limber.core.errors import InputError, Option, Text, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.rigid import composed, rotated
 from limber.core.progress import SILENT, Progress
-from limber.estimation.forward.observed_path import MotionMade, MotionWanted, moved
+from limber.estimation.forward.observed_path import MotionMade, MotionWanted, moved, seen_at
 from limber.estimation.rod import Rod, RodMotion
 from limber.estimation.settings import PullSpec
 from limber.estimation.uncertainty.model_error import refined
@@ -30,7 +30,6 @@ from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 from limber.mechanics.loads.loaded_branch import hang
 from limber.mechanics.materials.materials import RayleighDamping, young_weights
 from limber.mechanics.model import BranchModel
-from limber.mechanics.points import point_operator
 from limber.perception.observe import write_depth
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.recordings.recording import (
@@ -231,9 +230,8 @@ def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
     else:
         grasp = grasp_on(truth.mesh, entry.grasp)
         made = moved(model.gripped(grasp), grasp, requested, progress=progress)
-        operator, displacements = point_operator(truth.mesh, points), made.displacements
-        positions = np.array([points + (operator @ displacement.ravel()).reshape(-1, 3)
-                              for displacement in displacements])
+        displacements = made.displacements
+        positions = seen_at(points, truth.mesh, displacements)
     sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
              for part in (slice(0, 3), slice(3, 6))]
     wrenches, count, poses = made.wrenches.copy(), len(made.wrenches), made.poses

@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 
 from limber.core.errors import Command, Option, Text
 from limber.core.not_none import present
-from limber.estimation.forward.forward_model import Forward
+from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.recordings.recording import CalibrationEntry, PullEntry, calibration_of
 from limber.recordings.synchronisation import Frames
 
@@ -64,7 +64,9 @@ class Unknown:
         names: Of its errors in a pull; none where it does not act.
         unit: m, rad, N, N m, s, or empty: relative.
         sigma: Standard deviation of each in ``unit``, by the pull's calibration.
-        slopes: Change of the measurements by each, as in :class:`ErrorSlopes`.
+        slopes: Change of the measurements by each, [..., k], by their names in
+            :class:`limber.estimation.forward.forward_model.Simulated`; of the grasp, simulated less
+            recorded.
         is_shared: The cell has it, in one calibration; else each pull its own.
         measured: What measures it, and to which deviation.
     """
@@ -86,17 +88,6 @@ class Nuisance:
     unknown: Unknown
     sigma: float
     pull: str | None
-
-
-@dataclass(frozen=True)
-class ErrorSlopes:
-    """Change of predicted measurements by k errors, each in its deviations: points [f, m, 3, k],
-    forces and torques [f, 3, k], and simulated less recorded grasp point [f, 3, k] [m]."""
-
-    points: np.ndarray
-    forces: np.ndarray
-    torques: np.ndarray
-    grasps: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -202,21 +193,19 @@ class CellErrors:
     def count(self) -> int:
         return len(self.nuisances)
 
-    def slopes(self, index: int, positions: np.ndarray, forces: np.ndarray) -> ErrorSlopes:
-        """Slopes of pull ``index`` at its simulated positions [f, m, 3] and forces [f, 3]."""
+    def slopes(self, index: int, simulated: Simulated) -> Simulated:
+        """Change of a simulated pull ``index`` by all errors, each in its deviations."""
         forward = self._forwards[index]
-        frames, count = forward.frames, self.count
-        total = {"points": np.zeros((*positions.shape, count)),
-                 **{kind: np.zeros((len(frames), 3, count))
-                    for kind in ("forces", "torques", "grasps")}}
+        positions, frames = simulated.positions, forward.frames
+        total = Simulated.none(*positions.shape[:2], self.count)
         first = self._first[calibration_of(forward.entry)]
         pull = _Pull(forward.entry, frames, np.array(first.entry.grasp.point_m), first.rest_points,
-                     forward.grasp_tangent, forward.point_directions, positions, forces,
-                     forward.creep_time)
+                     forward.grasp_tangent, forward.point_directions, positions,
+                     simulated.forces, forward.creep_time)
         for unknown, sigma, used in self._places[index]:
             for kind, slope in unknown.slopes(pull).items():
-                total[kind][..., used] += slope * sigma
-        return ErrorSlopes(**total)
+                getattr(total, kind)[..., used] += slope * sigma
+        return total
 
 
 def _alike(pull: _Pull, course: np.ndarray) -> np.ndarray:
@@ -230,13 +219,13 @@ def _rotations(arms: np.ndarray) -> np.ndarray:
 
 
 def _turned(pull: _Pull) -> dict[str, np.ndarray]:
-    return {"points": _rotations(pull.positions - pull.rest.mean(axis=0))}
+    return {"positions": _rotations(pull.positions - pull.rest.mean(axis=0))}
 
 
 def _along(pull: _Pull) -> dict[str, np.ndarray]:
     """Each point alone moves along the branch, which bends with it."""
     directions = present(pull.directions, "direction of the branch at the observed points")
-    return {"points": directions[..., None] * np.eye(directions.shape[1])[:, None, :]}
+    return {"positions": directions[..., None] * np.eye(directions.shape[1])[:, None, :]}
 
 
 def _across(pull: _Pull) -> dict[str, np.ndarray]:
@@ -248,7 +237,7 @@ def _across(pull: _Pull) -> dict[str, np.ndarray]:
     turn = np.einsum("fmi,mik->fmk", directions, aside) / np.maximum(
         1 + np.einsum("fmi,mi->fm", directions, first), 0.1)[..., None]
     turned = aside - (directions + first)[..., None] * turn[:, :, None]
-    return {"points": np.einsum("fmik,mn->fmink", turned, np.eye(count)).reshape(
+    return {"positions": np.einsum("fmik,mn->fmink", turned, np.eye(count)).reshape(
         *directions.shape, 2 * count)}
 
 
@@ -256,8 +245,8 @@ def _late(pull: _Pull) -> dict[str, np.ndarray]:
     times = pull.frames.times
     # Frames at one instant, such as those of a settled load, have no speed.
     if np.any(np.diff(times) <= 0):
-        return {"points": np.zeros((*pull.positions.shape, 1))}
-    return {"points": np.gradient(pull.positions, times, axis=0)[..., None]}
+        return {"positions": np.zeros((*pull.positions.shape, 1))}
+    return {"positions": np.gradient(pull.positions, times, axis=0)[..., None]}
 
 
 def relaxed(times: np.ndarray, forces: np.ndarray, seconds: float) -> np.ndarray:
@@ -321,7 +310,7 @@ def _watches(forward: Forward) -> bool:
 
 UNKNOWNS = [
     Unknown(_CAMERA, _three("camera position", _has_points), "m",
-            lambda known: known.camera_sigma_m, lambda pull: {"points": np.broadcast_to(
+            lambda known: known.camera_sigma_m, lambda pull: {"positions": np.broadcast_to(
                 np.eye(3), (*pull.positions.shape, 3))}, measured=(REGISTER, 1e-3)),
     Unknown(_CAMERA, _three("camera rotation about", _has_points), "rad",
             lambda known: known.camera_sigma_rad, _turned, measured=(REGISTER, 1e-3)),

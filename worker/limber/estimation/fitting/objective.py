@@ -14,13 +14,34 @@ from limber.core.errors import Cancelled
 from limber.core.json_values import json_object
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.estimation.fitting.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated
-from limber.estimation.forward.forward_model import Forward, Response, Simulated
-from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
+from limber.estimation.fitting.nuisances import CellErrors, Eliminated, eliminated
+from limber.estimation.forward.forward_model import Forward, Simulated
+from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.recordings.synchronisation import Frames
 
 # One pull's differences of simulated and measured values, each over its standard deviation.
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of measurement, of this name in ``Simulated``: values [f, ..., 3], which are there
+    [f, ...], inverse deviations [f, ..., 3, 3], and its cause of uncertainty."""
+
+    name: str
+    cause: str
+    measured: np.ndarray
+    known: np.ndarray
+    whitening: np.ndarray
+
+    def scaled(self, values: np.ndarray) -> np.ndarray:
+        """Values or their slopes [f, ..., 3(, P)] over the deviations."""
+        slopes = values if values.ndim > self.measured.ndim else values[..., None]
+        return np.einsum("...ij,...jp->...ip", self.whitening, slopes).reshape(values.shape)
+
+    def residual(self, simulated: Simulated) -> np.ndarray:
+        """Difference over its deviation, [f, ..., 3]; NaN: not measured."""
+        return self.scaled(getattr(simulated, self.name) - self.measured)
 
 
 class Residuals:
@@ -28,68 +49,51 @@ class Residuals:
 
     def __init__(self, forward: Forward, force_sigma: float):
         self._forward, frames = forward, forward.frames
+        self._span: tuple[Simulated, np.ndarray, np.ndarray] | None = None
         values, vectors = np.linalg.eigh(frames.covariance)
+        averaged = np.sqrt(np.maximum(frames.wrench_counts, 1))
+
+        def read(name: str, part: slice, sigma: float | None) -> _Kind:
+            measured = frames.wrenches[:, part]
+            deviation = present(sigma, f"deviation of the {name}") / averaged
+            return _Kind(name, "noise of the force", measured, np.isfinite(measured).all(axis=1),
+                         np.eye(3) / deviation[:, None, None])
+
         # Inverse square roots of the covariances, shape [f, m, 3, 3].
-        self._whitening = np.einsum("fmij,fmj,fmkj->fmik", vectors, 1 / np.sqrt(values), vectors)
-        self._averaged = np.sqrt(np.maximum(frames.wrench_counts, 1))
-        self._sigma = force_sigma / self._averaged
-        self._span: tuple[Response, np.ndarray, np.ndarray] | None = None
+        self._points = _Kind(
+            "positions", "noise of the points", frames.positions, seen_in(frames),
+            np.einsum("fmij,fmj,fmkj->fmik", vectors, 1 / np.sqrt(values), vectors))
+        self._force = read("forces", slice(3), force_sigma)
+        self._kinds = [self._points]
+        if forward.uses_force:
+            self._kinds.append(self._force)
+        if forward.uses_torque:
+            self._kinds.append(read("torques", slice(3, 6),
+                                    forward.entry.sensor.torque_sigma_nm))
+        if forward.watches_pose:
+            self._kinds.append(_Kind(
+                "grasps", "noise of the gripper's poses", frames.poses[:, :3],
+                np.ones(len(frames), bool), np.eye(3) / forward.pose_sigma))
 
-    def points(self, simulated: Simulated) -> np.ndarray:
-        """Residuals of the points over their deviations, shape [f, m, 3]; NaN: not observed."""
-        off = simulated.positions - self._forward.frames.positions
-        return np.einsum("fmij,fmj->fmi", self._whitening, off)
-
-    def forces(self, simulated: Simulated) -> np.ndarray:
-        """Residuals of the force over its deviation, shape [f, 3]; NaN: not measured."""
-        off = simulated.forces - self._forward.frames.wrenches[:, :3]
-        return off / self._sigma[:, None]
+    def standardised(self, simulated: Simulated) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals of points [f, m, 3] and force [f, 3]; NaN: not measured."""
+        return self._points.residual(simulated), self._force.residual(simulated)
 
     def rows(self, simulated: Simulated) -> tuple[np.ndarray, np.ndarray | None]:
         """All residuals, of points, force, torque and gripper, [r], and their slopes [r, P]."""
-        seen, force, torque = self._known(simulated.torques is not None)
-        forward = self._forward
-        residual = [self.points(simulated)[seen].ravel()]
-        if force is not None:
-            residual.append(self.forces(simulated)[force].ravel())
-        if torque is not None:
-            off = simulated.torques - forward.frames.wrenches[:, 3:]
-            residual.append((off / self._torque_sigma()[:, None])[torque].ravel())
-        if forward.compares_grasp:
-            off = simulated.grasps - forward.frames.poses[:, :3]
-            residual.append((off / forward.pose_sigma).ravel())
-        if simulated.d_positions is None:
-            return np.concatenate(residual), None
-        return np.concatenate(residual), self.slopes(
-            simulated.d_positions, present(simulated.d_forces, "derivative of the force"),
-            simulated.d_torques, simulated.d_grasps)
+        residual = np.concatenate([each.residual(simulated)[each.known].ravel()
+                                   for each in self._kinds])
+        return residual, None if simulated.slopes is None else self.slopes(simulated.slopes)
 
-    def slopes(self, points: np.ndarray, forces: np.ndarray, torques: np.ndarray | None,
-               grasps: np.ndarray | None) -> np.ndarray:
+    def slopes(self, changes: Simulated) -> np.ndarray:
         """Slopes of the residuals, [r, P], from those of the predicted measurements."""
-        seen, force, torque = self._known(torques is not None)
-        slope = np.einsum("fmij,fmjp->fmip", self._whitening, points)
-        rows = [slope[seen].reshape(-1, slope.shape[-1])]
-        if force is not None:
-            slope = forces / self._sigma[:, None, None]
-            rows.append(slope[force].reshape(-1, slope.shape[-1]))
-        if torque is not None:
-            slope = torques / self._torque_sigma()[:, None, None]
-            rows.append(slope[torque].reshape(-1, slope.shape[-1]))
-        if self._forward.compares_grasp:
-            slope = present(grasps, "derivative of the grasp's position") / self._forward.pose_sigma
-            rows.append(slope.reshape(-1, slope.shape[-1]))
-        return np.vstack(rows)
+        count = changes.positions.shape[-1]
+        return np.vstack([each.scaled(present(getattr(changes, each.name), each.name))[
+            each.known].reshape(3 * int(each.known.sum()), count) for each in self._kinds])
 
-    def kinds(self, simulated: Simulated) -> list[str]:
+    def kinds(self) -> list[str]:
         """Cause of uncertainty of each residual; length r."""
-        seen, force, torque = self._known(simulated.torques is not None)
-        kinds = ["noise of the points"] * (3 * int(seen.sum()))
-        kinds += ["noise of the force"] * (3 * sum(
-            int(known.sum()) for known in (force, torque) if known is not None))
-        if self._forward.compares_grasp:
-            kinds += ["noise of the gripper's poses"] * (3 * len(self._forward.frames))
-        return kinds
+        return [each.cause for each in self._kinds for _ in range(3 * int(each.known.sum()))]
 
     def span(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Orthonormal columns of all changes that the unknowns of the input force can cause, and
@@ -98,11 +102,7 @@ class Residuals:
         if response is None:
             return None
         if self._span is None or self._span[0] is not response:
-            wrenches = response.wrenches
-            columns = self.slopes(response.points, wrenches[:, :3],
-                                  wrenches[:, 3:] if wrenches.shape[1] == 6 else None,
-                                  response.grasps)
-            self._span = (response, *np.linalg.qr(columns))
+            self._span = (response, *np.linalg.qr(self.slopes(response)))
         return self._span[1:]
 
     def beside(self, rows: np.ndarray) -> np.ndarray:
@@ -114,18 +114,6 @@ class Residuals:
         """Change of the unknown input force that explains the residuals."""
         columns, triangle = present(self.span(), "response of the pull to its force")
         return -np.linalg.lstsq(triangle, columns.T @ self.rows(simulated)[0], rcond=1e-9)[0]
-
-    def _known(self, has_torque: bool,
-               ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-        """Which points, forces and torques were measured; None: they are not compared."""
-        measured = np.isfinite(self._forward.frames.wrenches)
-        return (seen_in(self._forward.frames),
-                measured[:, :3].all(axis=1) if self._forward.uses_force else None,
-                measured[:, 3:].all(axis=1) if has_torque else None)
-
-    def _torque_sigma(self) -> np.ndarray:
-        sigma = present(self._forward.entry.sensor.torque_sigma_nm, "deviation of the torque")
-        return sigma / self._averaged
 
 
 def seen_in(frames: Frames) -> np.ndarray:
@@ -260,9 +248,13 @@ class Evaluation:
     @property
     def deviations(self) -> np.ndarray:
         """Standard deviation of each free value from these derivatives, shape [p]."""
-        _, values, rows = np.linalg.svd(self.slopes, full_matrices=False)
-        spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
-        return np.sqrt(np.sum(spread**2, axis=1))
+        return deviations_by(self.slopes)
+
+
+def deviations_by(slopes: np.ndarray) -> np.ndarray:
+    """Standard deviations [p] from slopes [r, p] of residuals of unit variance."""
+    _, values, rows = np.linalg.svd(slopes, full_matrices=False)
+    return np.linalg.norm(rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300)), axis=1)
 
 
 @dataclass(frozen=True)
@@ -329,9 +321,8 @@ class Objective:
                 not jacobian or last.jacobian is not None):
             return last
         values = self.space.unpack(free)
-        young = " ".join(f"{each / 1e6:.3g}" for each in values.young)
+        young = _listed(values)
         try:
-            self._report("simulating", young_mpa=young)
             found = self._simulated(free, values, jacobian)
             if last is None or not np.array_equal(last.free, free):
                 # The derivative at a known state does not count as a simulation.
@@ -356,7 +347,7 @@ class Objective:
 
     def standardised(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per pull: residuals over deviations of points [f, m, 3] and force [f, 3]; NaN: none."""
-        return [(each.points(simulated), each.forces(simulated))
+        return [each.standardised(simulated)
                 for each, simulated in zip(self._residuals, evaluation.pulls, strict=True)]
 
     def scored(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -380,7 +371,7 @@ class Objective:
     def _simulated(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
         """Simulate all pulls; unknown forces with a recorded path are iterated until settled."""
         settling = {index: forward for index, forward in enumerate(self.forwards)
-                    if is_path_observed(forward)}
+                    if isinstance(forward, ObservedPathForward)}
         if not settling:
             return self._compared(free, values, jacobian)
         left = sum(forward.iteration_limit for forward in settling.values())
@@ -403,7 +394,8 @@ class Objective:
             if moved < SETTLED_FORCE_M:
                 if jacobian and found.jacobian is None:
                     found = self._compared(free, values, True)
-                self.keep_forces()
+                for forward in settling.values():
+                    forward.keep()
                 return found
             left -= sum(forward.iteration_count for forward in settling.values())
             if moved > (STILL_SETTLING if part == 1.0 else 1.0) * last or left < 0:
@@ -412,7 +404,9 @@ class Objective:
             for forward, change in zip(settling.values(), changes, strict=True):
                 forward.shift_force(part * change)
         # Parameters for which the force does not converge are too far away: no step there.
-        self.step_back()
+        self.forget()
+        for forward in settling.values():
+            forward.step_back()
         return None
 
     def _foreseen(self, free: np.ndarray, settling: dict[int, ObservedPathForward],
@@ -427,28 +421,19 @@ class Objective:
                 forward.is_settled_for(known) for forward in settling.values()):
             return {}
         step = np.r_[self.space.membership @ step[:count], step[count:]]
-        found = self.compare(free, [pull.moved(step) for pull in pulls])
+        found = self.compare(free, [pull.moved(present(pull.slopes, "derivatives"), step)
+                                    for pull in pulls])
         return {index: self._residuals[index].force_change(found.pulls[index])
                 for index in settling}
 
-    def keep_forces(self) -> None:
-        """Store the forces of settling pulls; :meth:`step_back` returns to them."""
-        for forward in self.forwards:
-            if is_path_observed(forward):
-                forward.keep()
-
-    def step_back(self) -> None:
-        """Return to the last stored forces."""
-        self._last = None
-        for forward in self.forwards:
-            if is_path_observed(forward):
-                forward.step_back()
-
     def _compared(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
-        found = [forward.simulate(values, self.space.extra, jacobian) for forward in self.forwards]
-        pulls = [pull for pull in found if pull is not None]
-        if len(pulls) < len(found):
-            return None
+        pulls = []
+        for forward in self.forwards:
+            self._report("simulating", young_mpa=_listed(values))
+            found = forward.simulate(values, self.space.extra, jacobian)
+            if found is None:
+                return None
+            pulls.append(found)
         if jacobian:
             self._linear = free, pulls
         return self.compare(free, pulls)
@@ -466,9 +451,8 @@ class Objective:
             if jacobian is not None:
                 jacobians.append(compared.beside(jacobian))
             if with_errors:
-                of_errors, by_errors = self._by_errors(index, simulated)
-                columns.append(compared.beside(by_errors))
-                slopes.append(of_errors)
+                slopes.append(self.cell_errors.slopes(index, simulated))
+                columns.append(compared.beside(compared.slopes(slopes[-1])))
         residual = np.concatenate(residuals)
         jacobian = self.on_free(np.vstack(jacobians)) if jacobians else None
         errors: Eliminated | None = None
@@ -476,7 +460,9 @@ class Objective:
             known = self.cell_errors.known
             residual, jacobian, eliminated_errors = eliminated(residual, jacobian,
                                                                np.vstack(columns), known)
-            pulls = [_shown(simulated, of_errors, eliminated_errors.values - known)
+            # As cell and sensors with these errors would show them.
+            pulls = [replace(simulated.moved(of_errors, eliminated_errors.values - known),
+                             slopes=simulated.slopes)
                      for simulated, of_errors in zip(pulls, slopes, strict=True)]
             errors = eliminated_errors
             unknown_count += self.cell_errors.count
@@ -493,27 +479,23 @@ class Objective:
         derivatives."""
         found = []
         for index, simulated in enumerate(evaluation.pulls):
-            residual, jacobian = self._residuals[index].rows(simulated)
-            errors = (self._by_errors(index, simulated)[1] if self.cell_errors.count
-                      else np.zeros((len(residual), 0)))
-            span = self._residuals[index].span()
+            compared = self._residuals[index]
+            residual, jacobian = compared.rows(simulated)
+            errors = compared.slopes(self.cell_errors.slopes(index, simulated))
+            span = compared.span()
             found.append(RawSlopes(
                 self.on_free(present(jacobian, "derivative of this evaluation")), errors,
-                None if span is None else span[0] @ span[1], residual,
-                self._residuals[index].kinds(simulated)))
+                None if span is None else span[0] @ span[1], residual, compared.kinds()))
         return found
 
-    def residual_slopes(self, evaluation: Evaluation, changes: Sequence[ErrorSlopes],
+    def residual_slopes(self, evaluation: Evaluation, changes: Sequence[Simulated],
                         ) -> np.ndarray:
         """Change [r, S] of residuals by S changes of the pulls' predictions, without the part that
         unknowns of a force and errors of cell and sensors would explain."""
         rows, columns = [], []
-        for compared, piece, simulated, change in zip(
-                self._residuals, self.raw_slopes(evaluation), evaluation.pulls, changes,
-                strict=True):
-            rows.append(compared.beside(compared.slopes(
-                change.points, change.forces,
-                None if simulated.torques is None else change.torques, change.grasps)))
+        for compared, piece, change in zip(
+                self._residuals, self.raw_slopes(evaluation), changes, strict=True):
+            rows.append(compared.beside(compared.slopes(change)))
             columns.append(compared.beside(piece.errors))
         found = np.vstack(rows)
         if self.cell_errors.count:
@@ -521,27 +503,10 @@ class Objective:
             found = present(left, "derivative of the residuals")
         return np.vstack([found, np.zeros((self.space.own_row_count, found.shape[1]))])
 
-    def _by_errors(self, index: int, simulated: Simulated) -> tuple[ErrorSlopes, np.ndarray]:
-        """Effect of errors of cell and sensors on a pull and on its standardised residuals."""
-        found = self.cell_errors.slopes(index, simulated.positions, simulated.forces)
-        torques = None if simulated.torques is None else found.torques
-        return found, self._residuals[index].slopes(found.points, found.forces, torques,
-                                                    found.grasps)
-
     def on_free(self, jacobian: np.ndarray) -> np.ndarray:
         """Derivatives to the free vector from those to the physical parameters, [r, p]."""
         count = len(self.space.groups)
         return np.hstack([jacobian[:, :count] @ self.space.membership, jacobian[:, count:]])
-
-def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Simulated:
-    """Return a pull as cell and sensors with these errors would show it."""
-    def moved(measured: np.ndarray | None, slope: np.ndarray) -> np.ndarray | None:
-        return None if measured is None else measured + slope @ values
-
-    return replace(simulated, positions=simulated.positions + slopes.points @ values,
-                   forces=simulated.forces + slopes.forces @ values,
-                   torques=moved(simulated.torques, slopes.torques),
-                   grasps=moved(simulated.grasps, slopes.grasps))
 
 
 def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, str]:
@@ -551,3 +516,7 @@ def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, 
     deviations = found.deviations[list(space.groups)]
     return {"young_factor": " ".join(f"{np.exp(min(1.96 * each, 35.0)):.3g}"
                                      for each in deviations)}
+
+
+def _listed(values: Values) -> str:
+    return " ".join(f"{each / 1e6:.3g}" for each in values.young)

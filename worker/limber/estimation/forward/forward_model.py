@@ -1,7 +1,8 @@
 """Interface of all forward simulations of a pull."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -237,16 +238,6 @@ CLIPPED = 4.0
 
 
 @dataclass(frozen=True)
-class Response:
-    """Response to L force unknowns where linearised [per N]: points [f, m, 3, L], force or with
-    torque too [f, 3 or 6, L], and the gripper's position [f, 3, L] (None: not observed)."""
-
-    points: np.ndarray
-    wrenches: np.ndarray
-    grasps: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
 class Course:
     """Force over time, with torque if clamped: values [k, c] [N, N m] at key frames, spread to all
     by [f, k]. ``exact``: a stated load without unknowns, not a reading."""
@@ -319,14 +310,14 @@ def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) 
     return np.array([refined_solve(tangent, force, load, tolerance=1e-5) for load in loads])
 
 
-def response_of(spread: np.ndarray, at_keys: np.ndarray) -> Response:
-    """Return the response at f frames from [k, c, m, 3] [m per N] at k key frames, by spread [f,
-    k]."""
-    keys, components = at_keys.shape[:2]
+def response_of(spread: np.ndarray, at_keys: np.ndarray) -> "Simulated":
+    """Return a pull's change at f frames by its force at k key frames [per N], from the points'
+    [k, c, m, 3] there, by spread [f, k]."""
     points = np.einsum("fk,kcmi->fmikc", spread, at_keys)
-    wrenches = np.einsum("fk,cd->fckd", spread, np.eye(components))
-    return Response(points.reshape(*points.shape[:3], keys * components),
-                    wrenches.reshape(len(spread), components, keys * components))
+    wrenches = np.einsum("fk,cd->fckd", spread, np.eye(at_keys.shape[1]))
+    wrenches = wrenches.reshape(*wrenches.shape[:2], -1)
+    return Simulated(points.reshape(*points.shape[:3], -1), wrenches[:, :3],
+                     wrenches[:, 3:] if wrenches.shape[1] > 3 else None)
 
 
 def wrench_sigma(entry: PullEntry, frames: Frames, components: int) -> np.ndarray:
@@ -338,39 +329,40 @@ def wrench_sigma(entry: PullEntry, frames: Frames, components: int) -> np.ndarra
 
 @dataclass(frozen=True)
 class Simulated:
-    """A pull at all frames: points [f, m, 3], forces on the branch [f, 3], torques about the grasp
-    point (None: not known), grasp points (None: not compared). Slopes ``d_...`` [..., P], or None,
-    are in the order log E_1..log E_K and the extra parameters of the space."""
+    """What is measured of a pull at all frames: points [f, m, 3], forces on the branch [f, 3],
+    torques about the grasp point (None: not known), grasp points (None: not compared). Or the
+    changes of all that by P unknowns, [..., P]; a simulation's ``slopes`` (None: not asked for) are
+    those by log E_1..log E_K and the extra parameters of the space."""
 
     positions: np.ndarray
     forces: np.ndarray
-    d_positions: np.ndarray | None = None
-    d_forces: np.ndarray | None = None
     torques: np.ndarray | None = None
-    d_torques: np.ndarray | None = None
     grasps: np.ndarray | None = None
-    d_grasps: np.ndarray | None = None
+    slopes: "Simulated | None" = None
 
     @classmethod
-    def empty(cls, frames: int, points: int, torque: bool, parameters: int) -> "Simulated":
-        """Return arrays to fill, with derivatives to as many ``parameters``; 0: without."""
-        shape = (frames, points, 3)
-        return cls(np.empty(shape), np.empty((frames, 3)),
-                   np.empty((*shape, parameters)) if parameters else None,
-                   np.empty((frames, 3, parameters)) if parameters else None,
-                   np.empty((frames, 3)) if torque else None,
-                   np.empty((frames, 3, parameters)) if torque and parameters else None)
+    def empty(cls, frames: int, points: int, torque: bool, *parameters: int) -> "Simulated":
+        """Return arrays to fill, [..., P] by as many ``parameters``."""
+        at_frames = (frames, 3, *parameters)
+        return cls(np.empty((frames, points, 3, *parameters)), np.empty(at_frames),
+                   np.empty(at_frames) if torque else None)
 
+    @classmethod
+    def none(cls, frames: int, points: int, unknowns: int) -> "Simulated":
+        """Return no change of any measurement by some unknowns."""
+        change = (np.zeros((frames, 3, unknowns)) for _ in range(3))
+        return cls(np.zeros((frames, points, 3, unknowns)), *change)
 
-    def moved(self, step: np.ndarray) -> "Simulated":
-        """Return the pull after a small change of its P parameters, shape [P], to first order."""
-        def changed(name: str) -> np.ndarray | None:
-            value, slope = getattr(self, name), getattr(self, f"d_{name}")
-            return None if value is None else value + slope @ step
+    def each(self, changed: Callable[[np.ndarray], np.ndarray]) -> "Simulated":
+        """Return all of it, and its slopes, changed."""
+        return Simulated(*(None if values is None else values.each(changed) if isinstance(
+            values, Simulated) else changed(values) for values in vars(self).values()))
 
-        return Simulated(self.positions + self.d_positions @ step,
-                         self.forces + self.d_forces @ step,
-                         torques=changed("torques"), grasps=changed("grasps"))
+    def moved(self, slopes: "Simulated", step: np.ndarray) -> "Simulated":
+        """Return the pull after a small change [P] of the unknowns of these slopes, to first
+        order; it has none."""
+        return Simulated(*(None if values is None else values + getattr(slopes, name) @ step
+                           for name, values in vars(self).items() if name != "slopes"))
 
 
 def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
@@ -405,7 +397,7 @@ class Forward(ABC):
         self.name, self.entry, self.frames = name, entry, frames
         self.rest_points = np.asarray(rest_points, float)
         self.uses_force = bool(np.isfinite(frames.wrenches[:, :3]).all(axis=1).any())
-        self.response: Response | None = None
+        self.response: Simulated | None = None
         self.uses_torque = False
         self.grasp_tangent: np.ndarray | None = None
         self.point_directions: np.ndarray | None = None
@@ -444,11 +436,6 @@ class Forward(ABC):
         return False
 
     @property
-    def compares_grasp(self) -> bool:
-        """Whether the simulated grasp point is compared with the recorded path."""
-        return self.watches_pose
-
-    @property
     def pose_sigma(self) -> float:
         """Standard deviation of a recorded gripper position, without the common error [m]."""
         return calibration_of(self.entry).pose_noise_m
@@ -463,14 +450,22 @@ class Forward(ABC):
         """Whether a measured force with errors is prescribed."""
         return False
 
+    @abstractmethod
     def shift_force(self, change: np.ndarray) -> None:
         """Change the force's unknowns [L], in the order of the response's columns, and linearise
         there."""
-        raise NotImplementedError(f"{type(self).__name__} is not driven by a measured force.")
 
     def under_readings(self, simulated: Simulated) -> Simulated:
         """Predict a pull from its force readings alone, without its observed points."""
-        return simulated
+        if self.watches_pose or self.response is None:
+            return simulated
+        away = self.response.positions @ self._off_readings()
+        return replace(simulated, positions=simulated.positions + away,
+                       forces=np.full_like(simulated.forces, np.nan))
+
+    @abstractmethod
+    def _off_readings(self) -> np.ndarray:
+        """The readings less the force's unknowns [L], in the order of the response's columns."""
 
     def stands(self, values: Values) -> bool:
         """Whether the branch is stable under its weight with these values, in the scanned shape or
@@ -489,11 +484,10 @@ class Forward(ABC):
         """From now on simulate twice as many frames, if not all of them are simulated already."""
         return  # all of them are here
 
+    @abstractmethod
     def with_prescribed_poses(self, poses: np.ndarray) -> "Forward":
         """Return the same pull, on the full model, with other recorded poses [m, rad], [f, 6]; a
         slow one at few key frames, enough to show a difference."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be simulated with other recorded "
-                                  "poses.")
 
     def until(self, count: int) -> "Forward":
         """Return the part of a pull used by the first of several fits: the first ``count`` frames

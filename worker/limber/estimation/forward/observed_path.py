@@ -10,8 +10,9 @@ to an error of force, so the problem is well conditioned, and the more informati
 has more weight.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeGuard
+from typing import Any, Literal
 
 import numpy as np
 import scipy
@@ -20,13 +21,15 @@ from limber.core.errors import WorkError
 from limber.core.not_none import present
 from limber.core.numerics.rigid import any_normal, principal_axes, rotation_matrix
 from limber.core.progress import SILENT, Progress
-from limber.estimation.forward.forward_model import Forward, Response, Simulated, compliance
+from limber.estimation.forward.forward_model import Simulated, compliance
 from limber.estimation.forward.solved_pull import FEW_KEYS, QuasiStaticForward
 from limber.estimation.parameters import Values, equal_values, mechanics_names
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import StaticSettings, solve_static
@@ -83,6 +86,12 @@ class MotionMade:
     poses: np.ndarray
     wrenches: np.ndarray
     displacements: list[np.ndarray]
+
+
+def seen_at(points: np.ndarray, mesh: TetMesh, displacements: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the places [n, m, 3] of points [m, 3] that move with a mesh [m]."""
+    operator = point_operator(mesh, points)
+    return np.array([points + (operator @ each.ravel()).reshape(-1, 3) for each in displacements])
 
 
 def moved(model: BranchModel, grasp: Grasp, requested: MotionWanted, *,
@@ -282,7 +291,7 @@ class ObservedPathForward(QuasiStaticForward):
         return True
 
     def __init__(self, *arguments: Any, **options: Any):
-        self._grasp_slopes: dict[int, np.ndarray] = {}
+        self._held_slopes: dict[int, np.ndarray] = {}
         super().__init__(*arguments, **options)
 
     def set_key_count(self, count: int) -> None:
@@ -373,17 +382,14 @@ class ObservedPathForward(QuasiStaticForward):
                               strict=True)]
         self._drives_for = values
 
-    def under_readings(self, simulated: Simulated) -> Simulated:
-        return simulated
-
-    def _held(self, sensitivities: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    def _grasps(self) -> np.ndarray:
         states = self.states()
-        positions = np.array([self.grasp_position(state.displacement) for state in states])
         self.grasp_tangent = self.spread @ np.array(
             [self._tangent(state.displacement) for state in states])
-        if not sensitivities:
-            return positions, None
-        return positions, np.array([self._grasp_slopes[key] for key in range(len(states))])
+        return np.array([self.grasp_position(state.displacement) for state in states])
+
+    def _grasp_slopes(self) -> np.ndarray:
+        return np.array([self._held_slopes[key] for key in range(self.key_count)])
 
     def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
                       extra: tuple[str, ...], result: StaticResult) -> None:
@@ -398,13 +404,13 @@ class ObservedPathForward(QuasiStaticForward):
             mechanics_names(extra), shares=self.field.shares(values, extra)), state)
         slopes = -np.reshape(responses, (count + 3, -1)) @ np.reshape(
             changes, (len(changes), -1)).T
-        present(found.d_positions, "slopes")[key] = slopes[:count].reshape(-1, 3, len(changes))
-        present(found.d_forces, "slopes")[key] = 0.0
-        if found.d_torques is not None:
-            found.d_torques[key] = 0.0
-        self._grasp_slopes[key] = slopes[count:]
+        found.positions[key] = slopes[:count].reshape(-1, 3, len(changes))
+        found.forces[key] = 0.0
+        if found.torques is not None:
+            found.torques[key] = 0.0
+        self._held_slopes[key] = slopes[count:]
 
-    def _response(self, compliances: list[np.ndarray]) -> Response:
+    def _response(self, compliances: list[np.ndarray]) -> Simulated:
         found = super()._response(compliances)
         at_keys = np.array([self.grasp.position_slopes(
             self.mesh.nodes, state.displacement, np.moveaxis(np.asarray(each), 0, -1)).T
@@ -423,6 +429,3 @@ class ObservedPathForward(QuasiStaticForward):
         return axis * np.sign(axis @ outward or 1.0)
 
 
-def is_path_observed(forward: Forward) -> TypeGuard[ObservedPathForward]:
-    """Whether a pull's force is currently an unknown, and its gripper's path observed."""
-    return isinstance(forward, ObservedPathForward) and forward.watches_pose

@@ -3,7 +3,6 @@ with exact derivatives."""
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.estimation.forward.forward_model import (
     Course,
     Forward,
-    Response,
     Simulated,
     compliance,
     course_of,
@@ -173,8 +171,9 @@ class QuasiStaticForward(Forward):
                  ) -> Simulated | None:
         model = self.model_with(values)
         jump = None if self._values is None else np.log(values.young) - np.log(self._values.young)
-        found = Simulated.empty(len(self.keys), len(self.rest_points), self.uses_torque,
-                                len(values.young) + len(extra) if sensitivities else 0)
+        size = len(self.keys), len(self.rest_points), self.uses_torque
+        found, slopes = Simulated.empty(*size), Simulated.empty(
+            *size, len(values.young) + len(extra))
         states: list[_Memory | None] = []
         before: np.ndarray | None = None
         is_asked = (sensitivities or self.watches_pose) and self.response is None and (
@@ -195,7 +194,7 @@ class QuasiStaticForward(Forward):
             if is_asked:
                 compliances.append(compliance(model, before, self._loads[key]))
             if sensitivities:
-                slope = self._enter_slopes(found, key, model, values, extra, result)
+                slope = self._enter_slopes(slopes, key, model, values, extra, result)
             states.append(_Memory(result, slope))
         self._memory, self._values, self._hints = states, values, None
         if self._directions is not None:
@@ -203,11 +202,9 @@ class QuasiStaticForward(Forward):
                 self._directions.bent(state.displacement) for state in self.states()], axes=1)
         if is_asked:
             self.response = self._response(compliances)
-        grasps, d_grasps = self._held(sensitivities)
-        at_frames: dict[str, Any] = {
-            name: None if each is None else np.tensordot(self.spread, each, axes=1)
-            for name, each in vars(replace(found, grasps=grasps, d_grasps=d_grasps)).items()}
-        return Simulated(**at_frames)
+        found = replace(found, grasps=self._grasps(), slopes=replace(
+            slopes, grasps=self._grasp_slopes()) if sensitivities else None)
+        return found.each(lambda at_keys: np.tensordot(self.spread, at_keys, axes=1))
 
     def _enter(self, found: Simulated, key: int, result: StaticResult) -> None:
         drive = self._drives[key]
@@ -223,20 +220,23 @@ class QuasiStaticForward(Forward):
     def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
                       extra: tuple[str, ...], result: StaticResult) -> np.ndarray | None:
         """Enter the derivatives; return that of the displacement [n, 3, p], if it is known."""
-        points, forces = present(found.d_positions, "slopes"), present(found.d_forces, "slopes")
-        slope, forces[key] = self._slopes(model, values, extra, result)
+        slope, found.forces[key] = self._slopes(model, values, extra, result)
         for column in range(slope.shape[-1]):
-            points[key, ..., column] = self._observed(slope[..., column])
-        if found.d_torques is not None:
+            found.positions[key, ..., column] = self._observed(slope[..., column])
+        if found.torques is not None:
             names = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
-            found.d_torques[key] = 0.0 if self.drive == "force" else torque_slopes(
+            found.torques[key] = 0.0 if self.drive == "force" else torque_slopes(
                 model, self.grasp, names, result.displacement, slope,
                 self.frames.poses[self.keys[key], :3])
         return slope
 
-    def _held(self, _sensitivities: bool) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """The grasp point at the key frames and its derivatives, if they are compared."""
-        return None, None
+    def _grasps(self) -> np.ndarray | None:
+        """The grasp point at the key frames, if it is compared."""
+        return None
+
+    def _grasp_slopes(self) -> np.ndarray | None:
+        """Its derivatives."""
+        return None
 
     @property
     def force_is_stated(self) -> bool:
@@ -254,14 +254,10 @@ class QuasiStaticForward(Forward):
                                                      strict=True)]
         self._values, self.response = None, None
 
-    def under_readings(self, simulated: Simulated) -> Simulated:
-        if not self.has_force_unknowns or self.response is None:
-            return simulated
-        change = (self._measured - np.array(self._drives)).ravel()
-        return replace(simulated, positions=simulated.positions + self.response.points @ change,
-                       forces=np.full_like(simulated.forces, np.nan))
+    def _off_readings(self) -> np.ndarray:
+        return (self._measured - np.array(self._drives)).ravel()
 
-    def _response(self, compliances: list[np.ndarray]) -> Response:
+    def _response(self, compliances: list[np.ndarray]) -> Simulated:
         self._compliances = compliances
         return response_of(self.spread, np.array(
             [[self._observed(moved) for moved in each] for each in compliances]))
@@ -318,7 +314,7 @@ class QuasiStaticForward(Forward):
         made = type(self)(self.name, self._model, self.weights, self.entry,
                           replace(self.frames, poses=poses), self.rest_points,
                           key_count=FEW_KEYS, field=self.field)
-        made.lumped_weight = self.lumped_weight
+        made.lumped_weight, made.creep_time = self.lumped_weight, self.creep_time
         made.begin_at(self)
         return made
 
@@ -487,7 +483,8 @@ class DynamicForward(Forward):
         flat = slopes.displacement.reshape(len(frames), -1, count)
         d_positions = np.stack([(self._near @ frame).reshape(-1, 3, count) for frame in flat])
         d_forces = slopes.reaction_force if by_pose else np.zeros((len(frames), 3, count))
-        return Simulated(positions, forces, d_positions * scale, d_forces * scale)
+        return Simulated(positions, forces, slopes=Simulated(d_positions * scale,
+                                                             d_forces * scale))
 
     def until(self, count: int) -> "DynamicForward":
         """Return the first frames, driven by force if known: on a prescribed path wrong moduli give
@@ -508,16 +505,12 @@ class DynamicForward(Forward):
         self._forces = self._forces + change.reshape(-1, 3)
         self.response = None
 
-    def under_readings(self, simulated: Simulated) -> Simulated:
-        if self.response is None:
-            return simulated
-        change = (self.frames.wrenches[:, :3] - self._forces).ravel()
-        return replace(simulated, positions=simulated.positions + self.response.points @ change,
-                       forces=np.full_like(simulated.forces, np.nan))
+    def _off_readings(self) -> np.ndarray:
+        return (self.frames.wrenches[:, :3] - self._forces).ravel()
 
-    def _response(self, model: BranchModel) -> Response:
+    def _response(self, model: BranchModel) -> Simulated:
         loads = nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[0],
                             model.mesh.nodes, 3)
         count = len(self.frames)
         points = motion_response(model, loads, self._operator, self.frames.times)
-        return Response(points, np.eye(3 * count).reshape(count, 3, 3 * count))
+        return Simulated(points, np.eye(3 * count).reshape(count, 3, 3 * count))

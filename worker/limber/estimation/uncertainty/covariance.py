@@ -10,7 +10,6 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.nuisances import OTHER_CAUSES, advice_on
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import OUTLYING, Fit
-from limber.estimation.forward.solved_pull import DynamicForward, QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, YoungField
 from limber.estimation.uncertainty.drift import scale_steps
 from limber.recordings.recording import calibration_of
@@ -188,10 +187,7 @@ LONGEST_STEP = 0.5
 def averaged(fit: Fit, objective: Objective) -> Fit:
     """Return the fit moved to the mode of the moduli's marginal density; unchanged if the form of
     the field is not an unknown."""
-    full = objective.forwards[0]
-    if not isinstance(full, QuasiStaticForward | DynamicForward):
-        return fit
-    field = full.field
+    field = objective.forwards[0].field
     if not field.names or not set(field.names) <= set(objective.space.extra):
         return fit
     step = marginal_step(fit.evaluation, objective.space, field)

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from limber.estimation.fitting.nuisances import CREEP_SIGMA, ErrorSlopes, relaxed
+from limber.estimation.fitting.nuisances import CREEP_SIGMA, relaxed
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import Fit, gauss_newton
-from limber.estimation.forward.forward_model import Forward
+from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.uncertainty.covariance import repeated
 
 TIME_SHARES = (0.03, 0.1, 0.3, 1.0)
@@ -71,7 +71,7 @@ def _noise(residual: np.ndarray, kinds: list[np.ndarray], objective: Objective) 
     for each, forward in zip(kinds, objective.forwards, strict=True):
         forces = residual[start:start + len(each)][each == "noise of the force"]
         series.append(forces.reshape(-1, 3))
-        fitted += 0 if forward.response is None else forward.response.wrenches.shape[-1]
+        fitted += 0 if forward.response is None else forward.response.forces.shape[-1]
         start += len(each)
     count = sum(each.size for each in series)
     variance = sum(float(np.sum(each**2)) for each in series) / max(count - fitted, 1)
@@ -84,14 +84,12 @@ def _may_show(forward: Forward) -> bool:
             and len(forward.frames) >= FEWEST)
 
 
-def _change(forces: np.ndarray, forward: Forward, seconds: float) -> ErrorSlopes:
+def _change(forces: np.ndarray, forward: Forward, seconds: float) -> Simulated:
     """Change of a pull's measurements by one prior deviation of the share."""
-    count, points = len(forces), forward.frames.positions.shape[1]
-    slope = np.zeros((count, 3, 1))
+    found = Simulated.none(*forward.frames.positions.shape[:2], 1)
     if _may_show(forward):
-        slope[..., 0] = -CREEP_SIGMA * relaxed(forward.frames.times, forces, seconds)
-    none = np.zeros((count, 3, 1))
-    return ErrorSlopes(np.zeros((count, points, 3, 1)), slope, none, none)
+        found.forces[..., 0] = -CREEP_SIGMA * relaxed(forward.frames.times, forces, seconds)
+    return found
 
 
 def creep_sentence(creep: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import InputError, Option
-from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.objective import Evaluation, Objective, deviations_by
 from limber.estimation.parameters import ParameterSpace
 from limber.recordings.recording import calibration_of
 
@@ -128,7 +128,7 @@ def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
     messages = []
     while len(links) < space.group_count - 1:
         own = space.linked(tuple(links)).link_rows()
-        deviations = _deviations(np.vstack([rows, own]))[:space.group_count]
+        deviations = deviations_by(np.vstack([rows, own]))[:space.group_count]
         open_ones = deviations.copy()
         open_ones[[group for group, _ in links]] = 0.0
         worst = int(np.argmax(open_ones))
@@ -156,9 +156,3 @@ def force_is_measured(objective: Objective) -> bool:
         if forward.uses_force and np.nanmax(np.abs(force), initial=0.0) > 5 * sigma:
             return True
     return False
-
-
-def _deviations(jacobian: np.ndarray) -> np.ndarray:
-    _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
-    spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
-    return np.linalg.norm(spread, axis=1)

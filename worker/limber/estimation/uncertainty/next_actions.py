@@ -197,7 +197,7 @@ class Prospects:
                   if each.pull == name]
         first = objective.space.size + objective.cell_errors.count
         counts = [0 if forward.response is None else (
-            forward.response.points.shape[-1]) for forward in objective.forwards]
+            forward.response.positions.shape[-1]) for forward in objective.forwards]
         start = first + sum(counts[:number])
         return np.array([*errors, *range(start, start + counts[number])], int)
 

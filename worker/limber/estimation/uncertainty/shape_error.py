@@ -16,8 +16,8 @@ from scipy import sparse
 
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
-from limber.estimation.fitting.nuisances import ErrorSlopes
 from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.forward.forward_model import Simulated
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import Values
 from limber.estimation.uncertainty.model_error import WIDEST
@@ -52,7 +52,7 @@ response of a branch turned by a radian to the whole change of a radius is far f
 
 
 def compensation(evaluation: Evaluation, objective: Objective,
-                 slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
+                 slopes: Callable[[QuasiStaticForward, Values], Simulated]) -> np.ndarray | None:
     """Return the change of log E [K, S] by which a fit compensates S changes, -(J^T J)^-1 J^T dr at
     few key frames: it varies slowly. None if a pull is dynamic or has no equilibrium."""
     if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
@@ -71,7 +71,7 @@ def compensation(evaluation: Evaluation, objective: Objective,
 
 
 def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[TetMesh],
-                 ) -> ErrorSlopes:
+                 ) -> Simulated:
     """Return the change of a pull, last simulated for ``values``, by each of S shapes of its
     mesh."""
     nodes = forward.mesh.nodes
@@ -81,14 +81,14 @@ def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[T
                    [point_operator(mesh, forward.rest_points) - operator for mesh in meshes])
 
 
-def hung_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
+def hung_slopes(forward: QuasiStaticForward, values: Values) -> Simulated:
     """Return the change of a pull's observations by the relative mass of the added masses.
     Arguments as for :func:`shape_slopes`."""
     size = 3 * len(forward.rest_points), forward.mesh.nodes.size
     return _slopes(forward, values, [forward.with_hung_mass(1 + STEP)], [sparse.csr_matrix(size)])
 
 
-def grip_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
+def grip_slopes(forward: QuasiStaticForward, values: Values) -> Simulated:
     """Return the change of a pull's observations by the deviation of the length in its gripper.
     Arguments as for :func:`shape_slopes`."""
     size = 3 * len(forward.rest_points), forward.mesh.nodes.size
@@ -97,7 +97,7 @@ def grip_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
 
 
 def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiStaticForward],
-            elsewhere: Sequence[sparse.csr_matrix]) -> ErrorSlopes:
+            elsewhere: Sequence[sparse.csr_matrix]) -> Simulated:
     """Changes of pulls by a step; the points may then be elsewhere in the mesh."""
     here = _Pulled(forward, forward.model_with(values))
     equations = here.model.equations((forward.grasp,) if here.is_held else ())
@@ -114,7 +114,7 @@ def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiS
             after = other.seen(key, state + STEP * moved, out)
             changes.append([points.reshape(-1, 3), *(
                 (now - then) / STEP for now, then in zip(after, seen, strict=True))])
-    return ErrorSlopes(*(
+    return Simulated(*(
         np.einsum("fk,ks...->f...s", forward.spread, np.array(each).reshape(
             -1, len(others), *each[0].shape)) for each in zip(*changes, strict=True)))
 
