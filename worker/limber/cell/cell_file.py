@@ -344,7 +344,7 @@ def read_cell(path: str | Path) -> Cell:
         return validated(Cell, content)
     except ValidationError as error:
         problems = "; ".join(_problem_text(path, item) for item in error.errors())
-        raise InputError(problems, "The robot's position or reach would be wrong.",
+        raise InputError(problems, "A wrong entry can move the arm elsewhere, or stop it too late.",
                          "Correct the entries; lengths are in metres, angles in radians.",
                          ) from error
 
