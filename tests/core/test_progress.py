@@ -40,12 +40,12 @@ def test_json_lines_are_whole_and_throttled():
     stream = io.StringIO()
     progress = Progress(JsonSink(stream, interval_seconds=10))
     for step in range(100):
-        progress(step / 200, "a", loss=0.5)
+        progress(step / 200, "a", loss=0.5, not_known_yet=float("inf"))
     progress(0.9, "b")
     progress(1.0, "b")
     lines = [json.loads(line) for line in stream.getvalue().splitlines()]
     assert [line["message"] for line in lines] == ["a", "b", "b"]
-    assert lines[0]["loss"] == 0.5
+    assert lines[0]["loss"] == 0.5 and "not_known_yet" not in lines[0]
 
 
 @pytest.mark.slow
@@ -85,4 +85,4 @@ def test_without_a_terminal_a_line_says_what_goes_on():
         sink(0.25, "fitting", {"simulations": 4, "loss_m2": 0.5})
         _wait_until(lambda: stream.getvalue().count("\n") > 1)
     lines = stream.getvalue().splitlines()
-    assert lines[-1] == "estimate: 0 s, 25 % fitting simulations 4 loss_m2 0.5"
+    assert lines[-1] == "estimate: 0 s, 25 % fitting simulations 4, loss_m2 0.5"

@@ -12,6 +12,7 @@ what has been done so far.
 
 import contextlib
 import json
+import math
 import sys
 import threading
 import time
@@ -49,7 +50,10 @@ class Progress:
         if self._sink is not None:
             start, stop = self._span
             clipped = min(max(float(fraction), 0.0), 1.0)
-            self._sink(start + (stop - start) * clipped, message, numbers)
+            # A bound that is not known yet is infinite; JSON has no word for it.
+            known = {name: value for name, value in numbers.items()
+                     if not isinstance(value, float) or math.isfinite(value)}
+            self._sink(start + (stop - start) * clipped, message, known)
 
     def warn(self, *message: Part) -> None:
         """Warn the user of something that does not stop the work, in the parts of a ``Text``."""
@@ -224,7 +228,9 @@ class LineSink(contextlib.AbstractContextManager):
 
 
 def _figures(numbers: dict[str, Any]) -> str:
-    return " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
+    """Return the numbers as text: ``remaining_s=12`` is *remaining 12 s*."""
+    return ", ".join(f"{name[:-2]} {_short(value)} s" if name.endswith("_s")
+                     else f"{name} {_short(value)}" for name, value in numbers.items())
 
 
 def _short(value: Any) -> str:
