@@ -37,7 +37,7 @@ def cell_picture(cell: Cell, joints: np.ndarray, obstacles: Sequence[Obstacle],
     figure = Figure(figsize=(15.0, 6.0), layout="constrained")
     for axes, (title, across, up) in zip(figure.subplots(1, 3), _VIEWS, strict=True):
         axes.set(title=title, xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]",
-                 aspect="equal")
+                 aspect="equal", adjustable="datalim")
         axes.grid(alpha=0.25)
         _draw(axes, [across, up], cell, joints, obstacles, skeleton)
     handles, labels = figure.axes[0].get_legend_handles_labels()
