@@ -12,7 +12,6 @@ what has been done so far.
 
 import contextlib
 import json
-import math
 import sys
 import threading
 import time
@@ -51,8 +50,7 @@ class Progress:
             start, stop = self._span
             clipped = min(max(float(fraction), 0.0), 1.0)
             # A bound that is not known yet is infinite; JSON has no word for it.
-            known = {name: value for name, value in numbers.items()
-                     if not isinstance(value, float) or math.isfinite(value)}
+            known = {name: value for name, value in numbers.items() if value != float("inf")}
             self._sink(start + (stop - start) * clipped, message, known)
 
     def warn(self, *message: Part) -> None:
@@ -196,8 +194,7 @@ class LogSink:
             fraction, message, figures = self._last
             seconds = time.perf_counter() - start
             text = f"{self._title}: {seconds:.0f} s, {100 * fraction:.0f} % {message} {figures}"
-            self._stream.write(text.strip() + "\n")
-            self._stream.flush()
+            print(text.strip(), file=self._stream, flush=True)
 
 
 class LineSink(contextlib.AbstractContextManager):
@@ -222,15 +219,14 @@ class LineSink(contextlib.AbstractContextManager):
 
     def _write(self, text: str) -> None:
         """Overwrite the previous line."""
-        self._stream.write("\r" + text.ljust(len(self._shown)))
-        self._stream.flush()
+        print("\r" + text.ljust(len(self._shown)), end="", file=self._stream, flush=True)
         self._shown = text
 
 
 def _figures(numbers: dict[str, Any]) -> str:
     """Return the numbers as text: ``remaining_s=12`` is *remaining 12 s*."""
-    return ", ".join(f"{name[:-2]} {_short(value)} s" if name.endswith("_s")
-                     else f"{name} {_short(value)}" for name, value in numbers.items())
+    return ", ".join(f"{name.removesuffix('_s')} {_short(value)}{' s' * name.endswith('_s')}"
+                     for name, value in numbers.items())
 
 
 def _short(value: Any) -> str:
