@@ -16,7 +16,7 @@ from limber.planning import make_plan
 from limber.planning.certificate import lower_bound
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import grasp_model_of
-from limber.planning.field.stored_states import GraspSamples
+from limber.planning.field.stored_states import States
 from limber.stages.paths.energy import SampleEnergy
 from limber.store import Branch
 
@@ -49,7 +49,7 @@ class AnalyticBranch:
         points[0] = 0.0
         rotation = np.stack([-points[:, 1], points[:, 0], 0 * points[:, 0]], axis=1)
         energies = self.energy(points)
-        return GraspSamples(
+        return States(
             np.hstack([points, rotation]), energies, self.force(points),
             1.5 * points + [0.0, 0.0, 0.3], np.full(count, 0.95),
             np.asarray(rejected, float).reshape(-1, 6), 0.1 * points[:, 0] + 0.05,

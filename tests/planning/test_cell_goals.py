@@ -13,9 +13,9 @@ from limber.cell.cell_file import Cell, write_cell
 from limber.cell.obstacles import Box
 from limber.core.errors import NoPathError
 from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import Ball, CellPlace, GoalRequest, goal_points, with_near_side
 from limber.planning.goals.goal_kinds import CellGoal, TargetGoal, goal_of
-from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSpec
 from limber.stages.paths.plan_cell import cell_positions, hiding
@@ -155,7 +155,7 @@ def test_a_plan_ends_deeper_in_a_region_than_the_field_is_wrong(field):
 
 def test_states_of_a_plan_refine_the_border(field, small_model):
     """An end that does not do is a refused pose from then on, and no longer in the goal."""
-    states = SolvedPoses.of(small_model, [small_model.rest])
+    states = States.of(small_model, [small_model.rest])
     goal = side_goal(field, small_model).learnt(field)
     wrong = replace(states, poses=states.poses + [0, 0.02, 0, 0, 0, 0],
                     tips=states.tips + [0, 0.03, 0])

@@ -19,7 +19,7 @@ from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.refine import (
-    Limited,
+    Excesses,
     plan_gentle,
     plan_gentle_all,
     refine,
@@ -314,7 +314,7 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
     direction = np.random.default_rng(0).normal(size=path.shape)
     step = 1e-6
 
-    limits = Limited(problem, 1e-3)
+    limits = Excesses(problem, 1e-3)
 
     def both(points):
         value, slope = smooth_cost(points, problem.energy_field, problem.weights)

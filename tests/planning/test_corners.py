@@ -14,7 +14,7 @@ from limber.planning.cost import CostWeights
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.radial import KERNELS, RadialInterpolant
-from limber.planning.field.stored_states import GraspSamples
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import allowed_points
 from limber.planning.goals.goal_kinds import GraspGoal
 from limber.planning.path_problem import GentleProblem
@@ -39,7 +39,7 @@ def bowing_field():
     energy = 0.5 * ALONG * (flat[:, :2]**2).sum(axis=1) + MOST**2 / OFF * (
         off + np.log1p(np.exp(-2.0 * off)) - np.log(2.0))
     points = chart.curved(flat)
-    return fit_field(GraspSamples(
+    return fit_field(States(
         np.hstack([points, np.zeros_like(points)]), energy, chart.pull_back(points, slope),
         1.5 * points, np.ones(len(points)), np.empty((0, 6)), np.full(len(points), 0.01)),
                      np.zeros(3), RADIUS)

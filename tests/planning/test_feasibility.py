@@ -13,7 +13,7 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.field.stored_states import GraspSamples
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal_kinds import GraspGoal, default_goal
 from limber.planning.make_plan import solved_if_undecided
 from limber.planning.path_problem import BlockedError, GentleProblem
@@ -36,7 +36,7 @@ def shell_field():
     points = chart.curved(flat)
     slope = flat * [ALONG, ALONG, OFF]
     nothing = np.zeros((len(points), 3))
-    return fit_field(GraspSamples(
+    return fit_field(States(
         np.hstack([points, nothing]), 0.5 * (flat * slope).sum(axis=1),
         chart.pull_back(points, slope), 1.5 * points, np.ones(len(points)), np.empty((0, 6)),
         np.full(len(points), 0.01)), np.zeros(3), RADIUS)

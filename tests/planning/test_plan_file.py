@@ -8,7 +8,8 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.planning.constraints.limits import Limits
-from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
+from limber.planning.field.stored_states import States
+from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.plan_file import (
     limits_of_motion,
     path_record,
@@ -27,7 +28,7 @@ def solved(xs):
     poses = np.zeros((len(xs), 6))
     poses[:, 0] = xs
     vector = np.stack([xs, 0 * xs, 1 + xs], axis=1)
-    return SolvedPoses(
+    return States(
         poses=poses, energies=xs**2, forces=vector, torques=0.1 * vector, strains=0.01 * xs,
         strain_places=vector, stresses=1e6 * xs, min_det_f=1.0 + 0 * xs, tips=2 * vector,
         targets=np.stack([vector, 3 * vector], axis=1),

@@ -166,7 +166,7 @@ def test_a_field_is_the_full_model_s_at_any_number_of_processes(monkeypatch):
     for k in range(1, 60, 6):
         slow = model.follow(samples.positions[k:k + 1], model.rest.displacement)[0]
         assert samples.energies[k] == pytest.approx(model.energy(slow), rel=1e-5)
-        np.testing.assert_allclose(alone.displacements[k], slow.displacement, atol=1e-5)
+        np.testing.assert_allclose(samples.displacements[k], slow.displacement, atol=1e-5)
 
 
 def test_another_shape_than_the_rod_s_is_refused(monkeypatch, small_model):

@@ -1,6 +1,6 @@
 """Sampled grasp poses: where they lie, and that their energies and forces belong together."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +21,7 @@ from limber.planning.field.sampling import (
     solve_branch,
     walk_energy_surface,
 )
-from limber.planning.field.stored_states import samples_of
+from limber.planning.field.stored_states import States
 from limber.stages.paths.energy import EnergySettings
 from limber.store import Branch
 from limber.store.loading import load_grasp_model
@@ -61,7 +61,7 @@ def test_no_room_is_an_error():
 def sample_branch(model, targets, **options):
     """The full model's samples, and why others were refused."""
     good, bad = solve_branch(model, targets, **options)
-    return samples_of(good, targets[[one.target for one in bad]].reshape(-1, 3)), bad
+    return States.of(model, [model.rest], sloped=True).joined(*(one.state for one in good)), bad
 
 
 @pytest.fixture(scope="module")
@@ -112,24 +112,6 @@ def test_firm_grasp_at_the_natural_rotation_costs_no_more(small_model, some):
                             pose=small_model.pose(loose.displacement), start=loose.displacement)
         assert held.converged
         assert small_model.energy(held) == pytest.approx(small_model.energy(loose), rel=0.02)
-
-
-@pytest.mark.slow
-def test_the_number_of_processes_changes_no_digit(small_model, some, monkeypatch):
-    """One process and two: the same samples, bit for bit."""
-    monkeypatch.setenv("LIMBER_CORES", "2")
-    targets = some[0]
-    alone, together = (sample_branch(small_model, targets, workers=n)[0] for n in (1, 2))
-    assert alone.added == together.added == {}
-    for name in {entry.name for entry in fields(alone)} - {"added"}:
-        one, two = getattr(alone, name), getattr(together, name)
-        assert (one is None) == (two is None)
-        assert one is None or one.tobytes() == two.tobytes()
-
-
-def test_the_number_of_processes_is_no_setting_of_a_result():
-    """A field sampled with one is current for two."""
-    assert "workers" not in EnergySettings.model_fields
 
 
 @pytest.mark.slow

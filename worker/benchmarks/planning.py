@@ -210,7 +210,7 @@ def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, settings: En
     for number, place in enumerate(targets):
         progress(number / len(targets), "fresh poses")
         gaps = np.linalg.norm(sampled.samples.positions - place, axis=1)
-        there = model.follow(place[None], sampled.displacements[int(gaps.argmin())])[0]
+        there = model.follow(place[None], sampled.samples.displacements[int(gaps.argmin())])[0]
         if refusal(there):
             continue
         energy, force = model.energy(there), there.reaction_force

@@ -27,17 +27,17 @@ from limber.mechanics import BranchModel, young_weights
 from limber.mechanics.loads.loaded_branch import hang
 from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.constraints.chance import YoungUncertainty
-from limber.planning.constraints.limits import Limits, sampled_sizes
+from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, limited
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.planning.field.radial import LocalError
 from limber.planning.field.sampling import solve_branch
-from limber.planning.field.stored_states import samples_of
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import CellPlace, GoalRequest
 from limber.planning.goals.goal_kinds import GraspGoal, default_goal, goal_of, near
 from limber.planning.make_plan import PlannedMotion, plan_motion
-from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses, resolve_path
+from limber.planning.path_on_full_model import ResolvedPath, resolve_path
 from limber.planning.path_problem import BlockedError, GentleProblem, random_start
 from limber.planning.settings import PlanSpec
 from limber.stages.paths.plan_cell import cell_positions
@@ -447,14 +447,14 @@ def coverage(model: GraspModel, known: EnergyField, count: int, seed: int,
     """
     places = known.region.draw(count, np.random.default_rng(seed))
     good, _ = solve_branch(model, places, workers=1)
-    fresh = samples_of(good[1:], np.empty((0, 3)))
-    chart, inner = known.region.chart.plain, ~known.region.is_face()
-    values, limits = sampled_sizes(fresh), Limits(**dict.fromkeys(LIMITED, 1e9))
+    fresh = States.joined(*(one.state for one in good))
+    chart, inner = known.region.chart.plain, known.tested
+    values, limits = fresh.sizes, Limits(**dict.fromkeys(LIMITED, 1e9))
     above, found = limits.above(known), {}
     for one in limited(known, limits.on(known)):
         error = LocalError.of(chart.map(known.samples.positions)[inner], above[one.name][inner],
                               0.95)
-        off = one.size(fresh.positions) - np.abs(values[one.name])
+        off = one.size(fresh.positions) - values[one.name]
         kept = off <= error.at(chart.map(fresh.positions)) + 1e-12
         found[one.name] = int(kept.sum()), len(kept)
     return found
@@ -649,7 +649,7 @@ def _sure_plan(start: Start, unknown: YoungUncertainty, settings: PlanSpec,
     raise AssertionError("the last limit either has a plan or raises")
 
 
-def _likely_forces(unknown: YoungUncertainty, subject: Subject, states: SolvedPoses) -> np.ndarray:
+def _likely_forces(unknown: YoungUncertainty, subject: Subject, states: States) -> np.ndarray:
     """Return the largest force [N] that each state takes with the confidence, shape [n]."""
     peak = states.force_sizes.max()
     found = unknown.exposure(subject.model, ResolvedPath(

@@ -16,7 +16,7 @@ from limber.core.errors import NoPathError
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import plan_pair
-from limber.planning.cost import STEP, measure_path, resample
+from limber.planning.cost import STEP, PathMeasures, measure_path, resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.goal import Goal
 from limber.planning.path_problem import random_start
@@ -30,17 +30,6 @@ COMPARED = {BASELINE: "RRT*", "D-RRT*, not smoothed": "D-RRT*", "RRT*": "RRT*, s
 
 
 @dataclass(frozen=True)
-class PlannerScore:
-    """Length [m] of a path, its energies summed every 5 mm [N mm], their integral [J m] and the
-    largest [J]."""
-
-    length_m: float
-    energy_sum_nmm: float
-    energy_integral_jm: float
-    peak_energy_j: float
-
-
-@dataclass(frozen=True)
 class ComparedTrial:
     """One start: paths [n, 3] [m] and scores by the names of ``COMPARED``; ``gap_percent`` of the
     gentle path, or why there was none."""
@@ -48,7 +37,7 @@ class ComparedTrial:
     number: int
     start: np.ndarray
     paths: Mapping[str, np.ndarray]
-    scores: Mapping[str, PlannerScore]
+    scores: Mapping[str, PathMeasures]
     gap_percent: float | None = None
     trouble: str = ""
 
@@ -76,10 +65,8 @@ def _trial(field: EnergyField, goal: Goal, settings: PlanSettings, number: int,
                          {name: _score(field, path) for name, path in paths.items()}, gap)
 
 
-def _score(field: EnergyField, path: np.ndarray) -> PlannerScore:
-    measured = measure_path(path, field.energy(path), np.linalg.norm(field.force(path), axis=1))
-    return PlannerScore(measured.length_m, measured.energy_sum_nmm, measured.energy_integral_jm,
-                        measured.peak_energy_j)
+def _score(field: EnergyField, path: np.ndarray) -> PathMeasures:
+    return measure_path(path, field.energy(path), np.linalg.norm(field.force(path), axis=1))
 
 
 def summarised(trials: Sequence[ComparedTrial]) -> dict[str, dict[str, float | None]]:

@@ -18,7 +18,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import PathPair, plan_within, with_bound
 from limber.planning.certificate.lower_bound import ENOUGH
 from limber.planning.constraints.chance import Risk, YoungUncertainty
-from limber.planning.constraints.limits import Limits, sampled_sizes, sizes
+from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.motion_check import (
     MotionCheck,
     as_samples,
@@ -32,12 +32,11 @@ from limber.planning.cost import STEP, arc_lengths, resample
 from limber.planning.field.energy_field import UNITS, EnergyField, limited, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import solve_branch
-from limber.planning.field.stored_states import GraspSamples, Solved, samples_of
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
 from limber.planning.goals.goal_kinds import TargetGoal, goal_of, near
 from limber.planning.path_on_full_model import (
     ResolvedPath,
-    SolvedPoses,
     resolve_path,
     resolve_side_by_side,
 )
@@ -72,7 +71,7 @@ class WallCheck:
 
     solved: int
     bears_out: bool
-    learnt: GraspSamples | None = None
+    learnt: States | None = None
 
 
 def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: BlockedError,
@@ -85,20 +84,19 @@ def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, no
     if not len(points):
         return WallCheck(0, True)
     good, _ = solve_branch(grasp_model, points, workers=workers, progress=progress)
-    states = good[1:]
-    if not states:
+    if not good:
         return WallCheck(0, False)
-    samples = samples_of(states, np.empty((0, 3)))
-    nodes = grasp_model.mesh.nodes + np.array([one.displacement for one in states])
-    samples = replace(samples, added=limits.values(samples.positions, nodes))
-    is_wall = np.array([one.target < len(wall) for one in states])
+    samples = States.joined(*(one.state for one in good))
+    samples = replace(samples, added=limits.values(
+        samples.positions, grasp_model.mesh.nodes + samples.displacements))
+    is_wall = np.array([one.target < len(wall) for one in good])
     over, off = _over_and_off(field, limits, samples)
-    meets = np.array([_meets(field, goal, one) for one in states])
+    meets = np.array([_meets(field, goal, one.state) for one in good])
     if not np.where(is_wall, ~over | off, ~over & meets).any():
-        return WallCheck(len(states), True)
+        return WallCheck(len(good), True)
     away = np.linalg.norm(samples.positions[:, None] - field.samples.positions[None], axis=2)
     new = np.flatnonzero(away.min(axis=1) > _LEARNT_APART)
-    return WallCheck(len(states), False, samples.take(new) if len(new) else None)
+    return WallCheck(len(good), False, samples.take(new) if len(new) else None)
 
 
 def _chosen(wall: np.ndarray) -> np.ndarray:
@@ -118,33 +116,28 @@ def _chosen(wall: np.ndarray) -> np.ndarray:
     return np.reshape(chosen, (-1, 3))
 
 
-def _meets(field: EnergyField, goal: Goal, one: Solved) -> bool:
+def _meets(field: EnergyField, goal: Goal, state: States) -> bool:
     """Return whether a state is in the goal, or nearer to it than the field's error allows."""
-    place = one.pose[None, :3]
-    missed = goal.missed_by(SolvedPoses(
-        one.pose[None], np.array([one.energy]), one.force[None], one.torque[None],
-        np.array([one.strain]), one.strain_place[None], np.array([one.stress]),
-        np.array([one.min_det_f]), one.tip[None], one.targets[None],
-        np.array([one.axial_force]), one.displacement[None]))
+    place, missed = state.positions, goal.missed_by(state)
     by_field = float(goal.distance(field, place)[0]) - goal.tolerance
     return missed <= 0.0 or missed < by_field - float(goal.uncertainty(field, place)[0])
 
 
-def _over_and_off(field: EnergyField, limits: Limits, samples: GraspSamples,
+def _over_and_off(field: EnergyField, limits: Limits, samples: States,
                   ) -> tuple[np.ndarray, np.ndarray]:
     """Return which states break a limit, and which are farther below the field than its error, bool
     [n] each."""
-    sizes, points = sampled_sizes(samples), samples.positions
+    sizes, points = samples.sizes, samples.positions
     errors, asked = limits.errors(field), limits.asked()
     places = field.region.chart.plain.map(points)
     over, off = np.zeros(len(points), bool), np.zeros(len(points), bool)
     for one in limited(field, limits.on(field)):
-        size = sizes[one.name]
-        if size is None:
+        if one.name not in sizes:
             continue
-        over |= np.abs(size) > asked[one.name]
+        size = sizes[one.name]
+        over |= size > asked[one.name]
         if one.name in errors:
-            off |= one.size(points) - np.abs(size) > errors[one.name].at(places)
+            off |= one.size(points) - size > errors[one.name].at(places)
     return over, off
 
 
@@ -177,7 +170,7 @@ class Passages:
     """The easiest path to the goal on the full model: the states ``learnt`` there, and in words
     ``summary`` what it takes."""
 
-    learnt: GraspSamples
+    learnt: States
     summary: str
 
 
@@ -209,7 +202,7 @@ def solved_if_undecided(field: EnergyField, grasp_model: GraspModel, start: np.n
 def _demand_text(solved: ResolvedPath, limits: Limits) -> str:
     if not solved.is_whole:
         return "the branch cannot follow the easiest path on the full model"
-    values = sizes(solved.solved)
+    values = solved.solved.sizes
     shares = {name: float(values[name].max()) / limit for name, limit in limits.asked().items()
               if name in values}
     if not shares:

@@ -7,74 +7,13 @@ import numpy as np
 from limber.core.errors import Command, ConvergenceError, Option
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
-from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.rod import RodState
-from limber.planning.field.stored_states import LOADS
+from limber.planning.field.stored_states import States
 
 _APPROACH_STEP = 0.02  # [m] between poses on the path from rest to the start
 _MOST_UNSOLVED = 0.1  # fraction of a path's poses
-
-
-@dataclass(frozen=True)
-class SolvedPoses:
-    """States at poses [n, 6] [m, rad]: energy above hanging [J], force and torque [n, 3] of the
-    gripper on the branch, its outward part along it [N], largest Green-Lagrange strain and its rest
-    position, largest Cauchy stress [Pa], least det F, and positions of targets [n, targets, 3]."""
-
-    poses: np.ndarray
-    energies: np.ndarray
-    forces: np.ndarray
-    torques: np.ndarray
-    strains: np.ndarray
-    strain_places: np.ndarray
-    stresses: np.ndarray
-    min_det_f: np.ndarray
-    tips: np.ndarray
-    targets: np.ndarray
-    axial_forces: np.ndarray
-    displacements: np.ndarray
-
-    @classmethod
-    def of(cls, grasp_model: GraspModel, results: list[StaticResult]) -> "SolvedPoses":
-        """Return the states of solutions."""
-        moved = [result.displacement for result in results]
-        strains, positions, stresses = zip(*map(grasp_model.peak_load, moved), strict=True)
-        return cls(
-            poses=np.array([grasp_model.pose(u) for u in moved]),
-            energies=np.array([grasp_model.energy(result) for result in results]),
-            forces=np.array([result.reaction_force for result in results]),
-            torques=np.array([result.reaction_torque for result in results]),
-            strains=np.array(strains), strain_places=np.array(positions),
-            stresses=np.array(stresses),
-            min_det_f=np.array([float(result.min_det_f) for result in results]),
-            tips=np.array([grasp_model.tip(u) for u in moved]),
-            targets=np.array([grasp_model.branch.target_positions(u) for u in moved]),
-            axial_forces=np.array([grasp_model.axial_force(result.displacement,
-                                                           result.reaction_force)
-                                   for result in results]),
-            displacements=np.array(moved))
-
-    @property
-    def force_sizes(self) -> np.ndarray:
-        """Magnitude of the gripper's force [N], shape [n]."""
-        return np.linalg.norm(self.forces, axis=1)
-
-    @property
-    def loads(self) -> dict[str, np.ndarray]:
-        """Loads by their names except closeness to obstacles, shape [n] each."""
-        return dict(zip(LOADS[:-1], (self.strains, self.stresses, self.axial_forces,
-                                     np.linalg.norm(self.torques, axis=1)), strict=True))
-
-    def take(self, index: np.ndarray) -> "SolvedPoses":
-        """Return the states of ``index``, in its order."""
-        return SolvedPoses(**{name: values[index] for name, values in vars(self).items()})
-
-    def joined(self, other: "SolvedPoses") -> "SolvedPoses":
-        """Return these states followed by those of ``other``."""
-        return SolvedPoses(**{name: np.concatenate([values, getattr(other, name)])
-                              for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -82,8 +21,8 @@ class ResolvedPath:
     """A path solved by finite elements, with states from hanging to its start, positions [k, 3] [m]
     without solution and why. It ends early, not ``is_whole``, if over a tenth is unsolved."""
 
-    solved: SolvedPoses
-    approach: SolvedPoses
+    solved: States
+    approach: States
     unsolved: np.ndarray
     reasons: tuple[str, ...]
     is_whole: bool
@@ -94,7 +33,7 @@ class ResolvedPath:
                             self.solved.force_sizes)
 
     @property
-    def ahead(self) -> SolvedPoses:
+    def ahead(self) -> States:
         """Approach and path, the pose where they join once."""
         joined = np.linalg.norm(self.approach.poses[-1, :3] - self.solved.poses[0, :3]) < 1e-9
         kept = np.arange(len(self.approach.poses) - joined)
@@ -143,7 +82,7 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
         (before if number < len(ahead) else good).append(result)
         state = result.displacement
     return ResolvedPath(
-        SolvedPoses.of(grasp_model, good or before[-1:]), SolvedPoses.of(grasp_model, before),
+        States.of(grasp_model, good or before[-1:]), States.of(grasp_model, before),
         np.array(unsolved).reshape(-1, 3), tuple(reasons), is_whole)
 
 

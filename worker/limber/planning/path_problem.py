@@ -8,7 +8,7 @@ import numpy as np
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
-from limber.planning.field.energy_field import EnergyField, FieldArrays, limited
+from limber.planning.field.energy_field import EnergyField, FieldArrays, Quantity, limited
 from limber.planning.field.radial import LocalError
 from limber.planning.goals.goal import Goal, allowed_points, over_limits, unit_hint
 from limber.planning.settings import PlanSettings
@@ -77,6 +77,11 @@ class GentleProblem:
             return self.beyond
         return replace(self.limits, max_energy=np.inf, max_force=np.inf,
                        max_loads=np.full_like(self.limits.max_loads, np.inf))
+
+    def sure_quantities(self) -> list[Quantity]:
+        """Return the quantities besides the force, with their :attr:`sure_limits`."""
+        return [replace(one, limit=one.limit + self.field_error) if one.name == "energy" else one
+                for one in limited(self.energy_field, self.sure_limits) if one.name != "force"]
 
     def cost(self, path: np.ndarray) -> float:
         """Return the cost of a polyline [n, 3]; infinite over a limit, too long or off the goal.

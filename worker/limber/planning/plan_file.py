@@ -45,9 +45,10 @@ from limber.planning.constraints.limits import Limits, with_unit
 from limber.planning.constraints.motion_check import field_error
 from limber.planning.cost import STEP, PathMeasures, measure_path, resample
 from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.goal_kinds import asked_kinds
-from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
+from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.planners.trees import chosen_engine
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import DEFAULT_PACE, Pace, times_along
@@ -237,7 +238,7 @@ class PlanFile:
     motion: PlanPath
 
 
-def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
+def path_record(solved: States, targets: tuple[str, ...] = (), *,
                 pace: Pace = DEFAULT_PACE, stops: tuple[int, ...] = (),
                 field_energies: np.ndarray | None = None,
                 phases: tuple[str, ...] | None = None) -> PlanPath:
@@ -398,7 +399,7 @@ def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMe
     + w e) of itself, and an integral by e times the length. A target has no bound."""
     weights, detour = pair.cost.weights, pair.detour
     cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
-    missed = np.abs(field.missed[cheap & ~field.region.is_face(), 0])
+    missed = np.abs(field.missed[cheap & field.tested, 0])
     error = float(np.quantile(missed, 0.95)) if len(missed) else float(
         np.abs(field.missed[:, 0]).max())
     cost = found.energy_integral_jm if detour else (

@@ -14,7 +14,6 @@ exceeds the limit by more than its error, and may contain a point of the goal wh
 near as its error.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -262,10 +261,12 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
     """Cells in which no point keeps the sure limits, bool [n], and this one's uncertainty by axis
     [n, 3]; ``nodes`` [n, 32] number each cell's ``positions`` [m, 3]."""
     over, uncertainty = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
-    for values, slopes, limits in _limited(cells.problem, positions):
+    for one in cells.problem.sure_quantities():
+        values, slopes = one.smooth(positions)
         along = cells.chart.push_forward(positions, slopes) * cells.edges
         least, bends = _least(values[nodes], along[nodes])
-        limit = limits[nodes[:, _AT]].max(axis=1)
+        spare = cells.problem.spare(one.name, positions)[nodes[:, _AT]].min(axis=1)
+        limit = one.smooth_limit(spare)
         over |= least > limit
         uncertainty = np.maximum(uncertainty, bends / limit[:, None])
     limit = cells.problem.sure_limits.max_force
@@ -280,21 +281,6 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
                             for axis in (1, 2, 3)], axis=1)
         uncertainty = np.maximum(uncertainty, (bends + corners) / limit)
     return over, uncertainty
-
-
-def _limited(problem: GentleProblem, positions: np.ndarray,
-             ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the limited quantities at ``positions`` [m, 3] besides the force, smooth, shape [m],
-    their slopes to the position, [m, 3], and their sure limits there, [m]."""
-    field, limits = problem.energy_field, problem.sure_limits
-    if limits.max_energy < np.inf:
-        yield (field.energy(positions), field.force(positions),
-               limits.max_energy + problem.field_error - problem.spare("energy", positions))
-    for name, limit in zip(field.load_names, limits.max_loads, strict=True):
-        if limit < np.inf:
-            load = field.load(positions, name)
-            yield (load**2, 2.0 * load[:, None] * field.load_gradient(positions, name),
-                   (limit - problem.spare(name, positions))**2)
 
 
 def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -594,24 +594,19 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, corners:
                  energy: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Return those of ``cells`` in which no point keeps the limits, including the field's error;
     ``energy`` [n] and ``force`` [n, 3] at ``corners`` [n, 3]: theirs and those next to them."""
-    limits, field, over = problem.sure_limits, problem.energy_field, np.zeros(cells.shape, bool)
+    limits, over = problem.sure_limits, np.zeros(cells.shape, bool)
     nodes = np.argwhere(corners_of(cells))
 
     def spare(name: str) -> np.ndarray:
         at_nodes = grid.spread(nodes, problem.spare(name, grid.points(nodes)))
         return np.nan_to_num(corner_values(at_nodes).min(axis=0))
-    if limits.max_energy < np.inf:
-        over |= least_between(grid.spread(corners, energy),
-                              grid.spread(corners, grid.along_edges(force)), cells) > (
-            limits.max_energy + problem.field_error - spare("energy"))
-    for name, limit in zip(field.load_names, limits.max_loads, strict=True):
-        if limit < np.inf:
+    for one in problem.sure_quantities():
+        beside, values, slopes = corners, energy, force
+        if one.name != "energy":
             beside = np.argwhere(widened(corners_of(cells)))
-            points = grid.points(beside)
-            load = field.load(points, name)
-            slopes = 2.0 * load[:, None] * grid.along_edges(field.load_gradient(points, name))
-            over |= least_between(grid.spread(beside, load**2), grid.spread(beside, slopes),
-                                  cells) > (limit - spare(name))**2
+            values, slopes = one.smooth(grid.points(beside))
+        over |= least_between(grid.spread(beside, values), grid.spread(
+            beside, grid.along_edges(slopes)), cells) > one.smooth_limit(spare(one.name))
     if limits.max_force < np.inf:
         over |= least_size(grid.spread(corners, force), cells) > limits.max_force - spare("force")
     return over

@@ -19,9 +19,10 @@ import scipy
 
 from limber.core.errors import ConvergenceError, Option
 from limber.core.progress import SILENT, Progress
-from limber.planning.constraints.limits import Limits, sizes
+from limber.planning.constraints.limits import Limits
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
+from limber.planning.field.stored_states import States
+from limber.planning.path_on_full_model import ResolvedPath
 
 _POSES = 10  # poses along the motion where a limit is near, beside the nearest ones
 _NEAR = 0.3  # fraction of a limit below which it is taken as kept
@@ -44,7 +45,7 @@ class Risk:
     def left(self, limits: Limits, path: ResolvedPath) -> Limits:
         """Return the limits on the estimate's branch in motion with which the motion keeps
         ``limits``. As far below the limits as at standstill, at the pose nearest to each."""
-        standing = sizes(path.ahead)
+        standing = path.ahead.sizes
         return limits.tightened({
             name: share * getattr(limits, name) / float(np.abs(standing[name]).max())
             for name, share in self.excess.items()})
@@ -181,7 +182,7 @@ class YoungUncertainty:
             except ConvergenceError:
                 if number == len(_FAR) - 1:
                     raise
-        known, surfaces = sizes(chosen), {}
+        known, surfaces = chosen.sizes, {}
         for name, limit in asked.items():
             near = np.flatnonzero(known[name] > _NEAR * limit)
             if len(near):
@@ -190,8 +191,8 @@ class YoungUncertainty:
                                                  _DEGREES.get(name, 1.0))
         return Exposure(asked, surfaces)
 
-    def solved(self, grasp_model: GraspModel, logs: np.ndarray, states: SolvedPoses,
-               ) -> SolvedPoses:
+    def solved(self, grasp_model: GraspModel, logs: np.ndarray, states: States,
+               ) -> States:
         """Return the same poses with changed moduli, each solved from its state. ConvergenceError
         if one cannot be solved."""
         other, results = self.scaled(grasp_model, logs), []
@@ -204,7 +205,7 @@ class YoungUncertainty:
                                        "unknown whether the limits hold.", "Choose a gentler goal, "
                                        "or omit ", Option("confidence"), ".").at(pose[:3])
             results.append(result)
-        return SolvedPoses.of(other, results)
+        return States.of(other, results)
 
 
 def _axes(covariance: np.ndarray) -> np.ndarray:
@@ -226,7 +227,7 @@ def _design(count: int, far: float) -> tuple[np.ndarray, np.ndarray]:
     return np.vstack([np.zeros((1, count)), unit, -unit, *between]), pairs
 
 
-def _parts(states: SolvedPoses, name: str) -> np.ndarray:
+def _parts(states: States, name: str) -> np.ndarray:
     """Return a limited quantity with its sign or direction, shape [n, parts]."""
     vectors = {"force": states.forces, "torque": states.torques}
     if name in vectors:
@@ -234,10 +235,10 @@ def _parts(states: SolvedPoses, name: str) -> np.ndarray:
     return (states.energies if name == "energy" else states.loads[name])[:, None]
 
 
-def _chosen(states: SolvedPoses, asked: dict[str, float]) -> np.ndarray:
+def _chosen(states: States, asked: dict[str, float]) -> np.ndarray:
     """Return the poses to solve: some of those that may break a limit under some moduli, evenly
     along the motion, and the pose nearest to each limit."""
-    known = sizes(states)
+    known = states.sizes
     high = np.flatnonzero(np.any([known[name] > max(_HIGH * known[name].max(), _NEAR * limit)
                                   for name, limit in asked.items()], axis=0))
     some = np.linspace(0, len(high) - 1, min(_POSES, len(high))).round().astype(int)

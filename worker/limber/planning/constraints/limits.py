@@ -23,10 +23,9 @@ from limber.cell.obstacles import Obstacle, closest
 from limber.core.errors import Command, InputError, Option, Text
 from limber.mechanics.materials.materials import strain_limit
 from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
-from limber.planning.field.radial import LocalError, slack_of
-from limber.planning.field.stored_states import GraspSamples
+from limber.planning.field.radial import LocalError, Slack, slack_of
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import empty_along
-from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
 
 
@@ -211,7 +210,7 @@ class Limits:
         missed = {"energy": known.missed[:, 0],
                   "force": np.linalg.norm(known.missed[:, 1:4], axis=1),
                   **dict(zip(known.load_names, known.missed[:, 4:].T, strict=True))}
-        values, inner = sampled_sizes(known.samples), ~known.region.is_face()
+        values, inner = known.samples.sizes, known.tested
         found = dict.fromkeys(UNITS, 0.0)
         for name, limit in self.asked().items():
             value = values.get(name)
@@ -231,7 +230,7 @@ class Limits:
         infinite: unknown): its largest overestimate, fitted without it, at samples not far over.
         Proofs need this; margins that most poses keep suffice for a plan that is checked."""
         found = dict.fromkeys(UNITS, 0.0)
-        inner, values = ~known.region.is_face(), sampled_sizes(known.samples)
+        inner, values = known.tested, known.samples.sizes
         above = self.above(known)
         for name, limit in self.asked().items():
             size = values.get(name)
@@ -284,17 +283,14 @@ class Limits:
     def _slackened(self, known: EnergyField, errors: dict[str, LocalError], share: float,
                    ) -> FieldArrays:
         """Return the field with the limits that have errors, tighter by a ``share`` of these."""
-        names = ("energy", "force", *known.load_names)
-        limits = {name: limit for name, limit in self.asked().items() if name in errors}
-        return known.limited(limits.pop("energy", np.inf), limits.pop("force", np.inf),
-                             low=self.low, high=self.high,
-                             slack=slack_of(names, errors, share), **limits)
+        return self.on(known, {name: -np.inf for name in self.asked() if name not in errors},
+                       slack_of(("energy", "force", *known.load_names), errors, share))
 
     def _local(self, known: EnergyField, side: float, covered: float, most: dict[str, float],
                ) -> dict[str, LocalError]:
         """Return the errors of the limits of ``most``; on the ``side`` of overestimates, 1, or
         underestimates, -1."""
-        inner, above = ~known.region.is_face(), self.above(known)
+        inner, above = known.tested, self.above(known)
         mapped = known.region.chart.plain.map(known.samples.positions)[inner]
         return {name: LocalError.of(mapped, side * above[name][inner], covered, limit)
                 for name, limit in most.items()}
@@ -303,37 +299,33 @@ class Limits:
         """Return the field with limits that it exceeds only where the branch exceeds these."""
         return self.on(known, {name: -more for name, more in self.doubts(known).items()})
 
-    def on(self, known: EnergyField, margins: dict[str, float] | None = None) -> FieldArrays:
-        """Return the field with these limits for compiled loops, tighter by ``margins``."""
+    def on(self, known: EnergyField, margins: dict[str, float] | None = None,
+           slack: Slack | None = None) -> FieldArrays:
+        """Return the field with these limits for the kernels, tighter by ``margins`` and
+        ``slack``."""
         less = margins or {}
         tighter: Any = {name: limit - less.get(name, 0.0)
                         for name, limit in self.asked().items()}
         return known.limited(tighter.pop("energy", np.inf), tighter.pop("force", np.inf),
-                             low=self.low, high=self.high, **tighter)
+                             low=self.low, high=self.high, slack=slack, **tighter)
 
-    def broken(self, states: SolvedPoses) -> list[Broken]:
+    def broken(self, states: States) -> list[Broken]:
         """Return the limits that states of the full model break, each at its worst state."""
         positions = states.poses[:, :3]
         outside = np.maximum(self.low - positions, positions - self.high).max(axis=1)
         asked = [(f"{name.replace('_', ' ')} [{UNITS[name]}]".replace(" []", ""), size,
-                  getattr(self, name)) for name, size in sizes(states).items()]
+                  getattr(self, name)) for name, size in states.sizes.items()]
         asked.append(("distance outside the workspace [m]", outside, 1e-6))
         return [Broken(name, float(values.max()), limit, positions[values.argmax()])
                 for name, values, limit in asked if values.max() > limit]
 
-    def kept(self, states: SolvedPoses) -> np.ndarray:
+    def kept(self, states: States) -> np.ndarray:
         """Return which states keep all limits, bool [n]."""
         positions = states.poses[:, :3]
-        within = [size <= getattr(self, name) for name, size in sizes(states).items()]
+        within = [size <= getattr(self, name) for name, size in states.sizes.items()]
         return (np.logical_and.reduce(within)
                 & (positions >= self.low - 1e-6).all(axis=1)
                 & (positions <= self.high + 1e-6).all(axis=1))
-
-
-def sampled_sizes(samples: GraspSamples) -> "dict[str, np.ndarray | None]":
-    """Return the limited quantities at samples, by the names of ``UNITS``, shape [m] each."""
-    return {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
-            **samples.loads}
 
 
 def with_unit(name: str) -> str:
@@ -346,9 +338,3 @@ def limits_in_file(entries: dict[str, dict[str, float]]) -> Limits:
     known: Any = {name: float(entries[with_unit(name)]["limit"]) for name in UNITS
                   if with_unit(name) in entries}
     return Limits(**known)
-
-
-def sizes(states: SolvedPoses) -> dict[str, np.ndarray]:
-    """Return the limited quantities, by the names of ``UNITS``, shape [n] each."""
-    return {"energy": states.energies, "force": states.force_sizes,
-            **{name: np.abs(values) for name, values in states.loads.items()}}

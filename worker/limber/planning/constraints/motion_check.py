@@ -7,7 +7,7 @@ peak. In between, where the branch merely follows, a step covers the distance be
 the static check solves.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -17,14 +17,14 @@ from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult, NewmarkSettings
-from limber.planning.constraints.limits import Broken, Limits, sizes, with_unit
+from limber.planning.constraints.limits import Broken, Limits, with_unit
 from limber.planning.cost import STEP
 from limber.planning.field.energy_field import UNITS, EnergyField, knowing
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import displacements_at
-from limber.planning.field.stored_states import GraspSamples
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import Goal
-from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
+from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.timing import Pace, poses_at, time_law
 
 _FINE = 1 / 60  # [s] longest step while speed changes
@@ -63,7 +63,7 @@ def check_motion(grasp_model: GraspModel, path: ResolvedPath, limits: Limits, pa
     """Move along approach, path and back, slowing up to ``slowings`` times until the limits hold.
     The path keeps them at standstill."""
     ahead = path.ahead
-    standing = {name: float(np.abs(size).max()) for name, size in sizes(ahead).items()}
+    standing = {name: float(np.abs(size).max()) for name, size in ahead.sizes.items()}
     paths = [(ahead.poses, ahead.displacements[0]),
              (ahead.poses[::-1], ahead.displacements[-1])]
     steps, began = 0, perf_counter()
@@ -196,7 +196,7 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
     return faults + limits.met(whole.poses[:, :3], nodes + whole.displacements)
 
 
-def field_error(field: EnergyField, states: SolvedPoses) -> float:
+def field_error(field: EnergyField, states: States) -> float:
     """Return the error of the field's energy against states, relative root mean square."""
     size = float(np.sqrt(np.mean(states.energies**2)))
     off = field.energy(states.poses[:, :3]) - np.maximum(states.energies, 0.0)
@@ -206,7 +206,7 @@ def field_error(field: EnergyField, states: SolvedPoses) -> float:
 
 
 def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
-           ) -> GraspSamples:
+           ) -> States:
     """Return states of a rejected path as samples: its end, where limits are broken, and where the
     field's error is largest; and poses without a solution as rejected ones."""
     whole = path.approach.joined(path.solved)
@@ -224,23 +224,18 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
         if len(chosen) < _MOST_LEARNT and (
                 np.linalg.norm(others - position, axis=1).min() > 0.5 * _APART):
             chosen.append(int(index))
-    return as_samples(grasp_model, whole.take(np.array(chosen, int)), field.samples, limits,
-                      path.unsolved)
+    return as_samples(grasp_model, whole.take(np.array(chosen, int)), limits, path.unsolved)
 
 
-def as_samples(grasp_model: GraspModel, states: SolvedPoses, like: GraspSamples, limits: Limits,
-               unsolved: np.ndarray = _NONE) -> GraspSamples:
-    """Return states as samples with what those ``like`` them have, and the quantities of the
-    ``limits``' constraints; ``unsolved`` grasp positions [q, 3] as rejected ones."""
-    names = ("targets", "torques", "strain_places", "stresses", "axial_forces")
-    optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
-    if like.shape_slopes is not None:
-        slopes = [grasp_model.shape_slopes(moved) for moved in states.displacements]
-        optional["shape_slopes"] = np.reshape(slopes, (-1, *like.shape_slopes.shape[1:]))
-    added = limits.values(states.poses[:, :3], grasp_model.mesh.nodes + states.displacements)
-    return GraspSamples(states.poses, states.energies, states.forces, states.tips,
-                        states.min_det_f, np.hstack([unsolved, np.zeros_like(unsolved)]),
-                        states.strains, added=added, **optional)
+def as_samples(grasp_model: GraspModel, states: States, limits: Limits,
+               unsolved: np.ndarray = _NONE) -> States:
+    """Return states with their slopes and the quantities of the ``limits``' constraints;
+    ``unsolved`` grasp positions [q, 3] as rejected poses."""
+    slopes = [grasp_model.shape_slopes(moved) for moved in states.displacements]
+    return replace(
+        states, rejected_poses=np.hstack([unsolved, np.zeros_like(unsolved)]),
+        shape_slopes=np.reshape(slopes, (len(slopes), 3, states.shape.shape[1])),
+        added=limits.values(states.positions, grasp_model.mesh.nodes + states.displacements))
 
 
 def with_constraints(field: EnergyField, grasp_model: GraspModel, limits: Limits,

@@ -26,8 +26,10 @@ from limber.planning.field.radial import (
     RadialInterpolant,
     Slack,
     slack_of,
+    slack_slopes,
+    slacks_at,
 )
-from limber.planning.field.stored_states import GraspSamples
+from limber.planning.field.stored_states import States
 from limber.planning.field.valid_region import TrustRegion
 
 # The kernel and the charts of a field's fit, chosen by cross-validation.
@@ -58,7 +60,7 @@ class FitChoice:
         return replace(chart, stretch=self.stretch, depth=self.depth * (chart.radius or 1.0))
 
 
-def chosen_fits(samples: GraspSamples, region: TrustRegion, charts: Sequence[tuple[float, float]],
+def chosen_fits(samples: States, region: TrustRegion, charts: Sequence[tuple[float, float]],
                 progress: Progress) -> tuple[FitChoice, FitChoice]:
     """Return the choices of least cross-validation error for the energy and for the shape;
     ``charts`` are stretch and depth of those to try."""
@@ -99,7 +101,7 @@ def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, f
     return best[0]
 
 
-def misplaced_tips(samples: GraspSamples, choice: FitChoice, chart: Chart,
+def misplaced_tips(samples: States, choice: FitChoice, chart: Chart,
                    channels: slice = slice(3)) -> np.ndarray:
     """Return the tip's error at each sample in the fit to all the others [m], and its targets' with
     more ``channels`` than those of the tip, shape [m, channels / 3]."""
@@ -112,7 +114,7 @@ def misplaced_tips(samples: GraspSamples, choice: FitChoice, chart: Chart,
     return np.linalg.norm(missed.reshape(len(missed), -1, 3), axis=2)
 
 
-def with_slopes(samples: GraspSamples) -> np.ndarray:
+def with_slopes(samples: States) -> np.ndarray:
     """Return the samples of the shape's fit: those with known slopes, which are unknown at a snap;
     all if hardly any are known."""
     everything = np.arange(len(samples.poses))
@@ -122,7 +124,7 @@ def with_slopes(samples: GraspSamples) -> np.ndarray:
     return known if len(known) >= 0.5 * len(everything) else everything
 
 
-def slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
+def slopes_on(chart: Chart, samples: States) -> np.ndarray | None:
     """Return the slopes of the shape to the chart's coordinates, [m, 3, channels], if all known."""
     if samples.shape_slopes is None or not np.isfinite(samples.shape_slopes).all():
         return None
@@ -140,7 +142,7 @@ def _spread_out(face: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.concatenate([np.flatnonzero(face), picked]))
 
 
-def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
+def cross_validated_errors(samples: States, chart: Chart, choice: FitChoice, face: np.ndarray,
                            ) -> tuple[dict[str, float], np.ndarray]:
     """Errors of a fit at each sample left out, in closed form: :func:`error_measures`, and
     prediction less truth of energy [J] and force [N] [m, 4]. Samples on the hull's ``face`` do not
@@ -160,7 +162,7 @@ def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoic
     return measures, np.column_stack([energy - np.maximum(samples.energies, 0.0), off])
 
 
-def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
+def error_measures(truth: States, energy: np.ndarray, force: np.ndarray,
                    ) -> dict[str, float]:
     """Errors of predictions. ``energy_error`` and ``force_error`` are root mean squares over that
     of the truth; ``_median`` and ``_most`` (95 %) are of each sample's over its own value;
@@ -190,15 +192,15 @@ def _rms(values: np.ndarray) -> float:
 
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
-             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n"}
-_WHAT = Text("an energy field (", Command("energy", Option("force", True)), " creates one)")
+             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "solved": "solved"}
+WHAT = Text("an energy field (", Command("energy", Option("force", True)), " creates one)")
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6), "chart_pivot_m": (3,),
            "chart_radius_m": ()}
 _OPTIONAL_SHAPES = {
     "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
-    "axial_forces_n": ("m",), "rest_pose": (6,)}
+    "axial_forces_n": ("m",), "solved": ("m",), "rest_pose": (6,)}
 """Shapes of the arrays in a file; equal letters are equal lengths."""
 _CHOSEN = ("energy_fit", "shape_fit")  # whose kernels and charts are in it
 
@@ -244,7 +246,7 @@ class EnergyField:
             [m, 1 + targets]; nan if not known.
     """
 
-    samples: GraspSamples
+    samples: States
     chart: Chart
     shape_chart: Chart
     energy_fit: RadialInterpolant
@@ -259,6 +261,11 @@ class EnergyField:
     def rest(self) -> np.ndarray:
         """Position of the grasp in the rest state [m], shape [3]."""
         return self.samples.positions[0]
+
+    @property
+    def tested(self) -> np.ndarray:
+        """Which samples tell the field's error, bool [m]: solved ones off the hull's face."""
+        return _tested(self.samples, self.region)
 
     @property
     def load_names(self) -> tuple[str, ...]:
@@ -294,7 +301,7 @@ class EnergyField:
         The largest distance at left-out samples, inside the samples' hull; infinite if none is
         known.
         """
-        off = self.misplaced[~self.region.is_face(), 0 if target is None else 1 + target]
+        off = self.misplaced[self.tested, 0 if target is None else 1 + target]
         return float(np.max(off, where=np.isfinite(off), initial=0.0)) if (
             np.isfinite(off).any()) else np.inf
 
@@ -306,7 +313,7 @@ class EnergyField:
         """
         chart, known = self.region.chart.plain, self._known_place_errors
         if (target, covered) not in known:
-            inner = ~self.region.is_face()
+            inner = self.tested
             known[target, covered] = LocalError.of(
                 chart.map(self.samples.positions)[inner],
                 self.misplaced[inner, 0 if target is None else 1 + target], covered,
@@ -384,11 +391,12 @@ class EnergyField:
             InputError: the file is not an energy field.
         """
         try:
-            arrays = read_arrays(path, _WHAT)
+            arrays = read_arrays(path, WHAT)
             require_shapes(path, arrays, _SHAPES | {
-                name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays}, _WHAT)
+                name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays}, WHAT,
+                           flags=("solved",))
             stored: dict[str, Any] = {name: arrays.get(key) for name, key in _OPTIONAL.items()}
-            samples = GraspSamples(
+            samples = States(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"], **stored)
             radius = float(arrays["chart_radius_m"])
@@ -408,7 +416,7 @@ class EnergyField:
                              ".") from error
 
 
-def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
+def fit_field(samples: States, base: np.ndarray | None = None, radius: float | None = None,
               *, progress: Progress = SILENT) -> EnergyField:
     """Fit the field with the kernel and chart of least cross-validation error.
 
@@ -434,17 +442,18 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     return _fitted(samples, *chosen_fits(samples, region, charts, progress), region)
 
 
-def refit(field: EnergyField, added: GraspSamples) -> EnergyField:
+def refit(field: EnergyField, added: States) -> EnergyField:
     """Return the field fitted to ``added`` samples as well, in the same manner."""
-    return _as_before(field, field.samples.joined(added))
+    return as_before(field, field.samples.joined(added))
 
 
 def knowing(field: EnergyField, added: dict[str, np.ndarray]) -> EnergyField:
     """Return the field with ``added`` quantities at its samples as loads, by name, [m] each."""
-    return _as_before(field, replace(field.samples, added=added))
+    return as_before(field, replace(field.samples, added=added))
 
 
-def _as_before(field: EnergyField, samples: GraspSamples) -> EnergyField:
+def as_before(field: EnergyField, samples: States) -> EnergyField:
+    """Return a field fitted to ``samples`` in the manner of ``field``."""
     energy, shape = (FitChoice(fit.kernel, fit.shape, chart.stretch,
                                chart.depth / (chart.radius or 1.0))
                      for fit, chart in ((field.energy_fit, field.chart),
@@ -454,10 +463,15 @@ def _as_before(field: EnergyField, samples: GraspSamples) -> EnergyField:
     return _fitted(samples, energy, shape, region)
 
 
-def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: TrustRegion,
+def _tested(samples: States, region: TrustRegion) -> np.ndarray:
+    return ~region.is_face() & (True if samples.solved is None else samples.solved)
+
+
+def _fitted(samples: States, choice: FitChoice, bent: FitChoice, region: TrustRegion,
             ) -> EnergyField:
     chart = choice.on(region.chart)
-    errors, missed = cross_validated_errors(samples, chart, choice, region.is_face())
+    tested = _tested(samples, region)
+    errors, missed = cross_validated_errors(samples, chart, choice, ~tested)
     in_chart = chart.map(samples.positions)
     forces = chart.push_forward(samples.positions, samples.forces)
     energy = RadialInterpolant.fit(in_chart, samples.energies, forces, kernel=choice.kernel,
@@ -475,8 +489,7 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
     found = misplaced_tips(bending, bent, region.chart, slice(None))
     misplaced = np.full((len(samples.poses), found.shape[1]), np.nan)
     misplaced[sure] = found
-    inside = ~region.is_face()[sure]
-    errors["tip_error_median_m"] = float(np.median(found[inside, 0]))
+    errors["tip_error_median_m"] = float(np.median(found[tested[sure], 0]))
     return EnergyField(samples, chart, shape_chart, energy, shape, loads, region, errors,
                        np.column_stack([missed, off]), misplaced)
 
@@ -490,15 +503,19 @@ def _rows(points: np.ndarray) -> np.ndarray:
 UNITS = {"energy": "J", "force": "N", "strain": "", "stress": "Pa", "axial_force": "N",
          "torque": "Nm", "closeness": ""}
 """Built-in limited quantities; a plan's constraints bring their own."""
+_STEP = 1e-5  # [m] of finite differences
 
 
 @dataclass(frozen=True)
-class Limited:
-    """A quantity of poses on the field, and its limit."""
+class Quantity:
+    """A quantity of poses on the field and its ``limit``, which ``slack`` tightens by position with
+    its row ``row``."""
 
     field: EnergyField
     name: str
     limit: float
+    row: int
+    slack: Slack
 
     @property
     def words(self) -> str:
@@ -512,14 +529,51 @@ class Limited:
             return np.linalg.norm(self.field.force(points), axis=1)
         return np.abs(self.field.load(points, self.name))
 
+    def share(self, points: np.ndarray) -> np.ndarray:
+        """Return it with the slack there, over its limit, shape [n]."""
+        size = self.size(points)
+        if self.slack.factors[self.row]:
+            size = size + slacks_at(self.field.region.chart.plain.map(points), self.row, self.slack)
+        return size / self.limit
+
+    def slope(self, points: np.ndarray) -> np.ndarray:
+        """Return the gradient of size and slack, shape [n, 3]."""
+        field, chart = self.field, self.field.region.chart.plain
+        if self.name == "energy":
+            slope = field.energy_gradient(points)
+        elif self.name == "force":
+            # The Hessian times F / |F|: one difference along the force.
+            force = field.force(points)
+            step = _STEP * force / np.maximum(np.linalg.norm(force, axis=1), 1e-12)[:, None]
+            slope = (field.force(points + step) - field.force(points - step)) / (2.0 * _STEP)
+        else:
+            slope = np.sign(field.load(points, self.name))[:, None] * field.load_gradient(
+                points, self.name)
+        if self.slack.factors[self.row]:
+            slope = slope + chart.pull_back(points, slack_slopes(chart.map(points), self.row,
+                                                                 self.slack))
+        return slope
+
+    def smooth(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the energy, or the square of a load, and its gradient: without a kink at 0."""
+        if self.name == "energy":
+            return self.field.energy(points), self.field.force(points)
+        load = self.field.load(points, self.name)
+        return load**2, 2.0 * load[:, None] * self.field.load_gradient(points, self.name)
+
+    def smooth_limit(self, spare: np.ndarray) -> np.ndarray:
+        """Return the limit of :meth:`smooth` where the quantity's is less by ``spare``."""
+        return self.limit - spare if self.name == "energy" else (self.limit - spare)**2
+
     def with_unit(self, value: float) -> str:
         """Return a value of it in words."""
         return f"{value:.3g} {UNITS.get(self.name, '')}".rstrip()
 
 
-def limited(field: EnergyField, limits: FieldArrays) -> Iterator[Limited]:
+def limited(field: EnergyField, limits: FieldArrays) -> Iterator[Quantity]:
     """Yield the quantities with a finite limit: energy, force, and loads."""
     of_loads = zip(field.load_names, limits.max_loads, strict=True)
-    for name, limit in (("energy", limits.max_energy), ("force", limits.max_force), *of_loads):
+    asked = (("energy", limits.max_energy), ("force", limits.max_force), *of_loads)
+    for row, (name, limit) in enumerate(asked):
         if limit < np.inf:
-            yield Limited(field, name, float(limit))
+            yield Quantity(field, name, float(limit), row, limits.slack)

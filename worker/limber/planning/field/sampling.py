@@ -12,7 +12,7 @@ every pose, in two or three iterations from the rod's shape and strain.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -24,7 +24,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart
 from limber.planning.field.grasp_model import GraspModel, Reach, refusal
 from limber.planning.field.rod import Rod, RodState
-from limber.planning.field.stored_states import GraspSamples, Solved, samples_of, taken
+from limber.planning.field.stored_states import Solution, States
 from limber.planning.settings import EnergySettings
 
 # Neighbouring samples that disagree, and the states of the branch between them.
@@ -221,11 +221,10 @@ TWO_SHAPES = "two shapes"
 
 @dataclass(frozen=True)
 class Sampled:
-    """Results of the branch model, the rest pose first, with all nodes' displacements [node_count,
-    3] [m], the shell that they follow, and rejected poses by reason; taut ones were left out."""
+    """Results of the branch model, the rest pose first, the shell that they follow, and rejected
+    poses by reason; taut ones were left out."""
 
-    samples: GraspSamples
-    displacements: list[np.ndarray]
+    samples: States
     energy_surface: LowEnergySurface
     reasons: dict[str, int]
     taut_count: int
@@ -260,18 +259,23 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
     field.sample_between(chart, usual, settings.samples - spread,
                          progress=progress.part(0.15, 0.3))
     asked = np.concatenate([field.positions[1:], lost])
-    solved = _solved(grasp_model, asked, [*field.states[1:], *([None] * len(lost))],
+    solved = solved_from(grasp_model, asked, [*field.states[1:], *([None] * len(lost))],
                      workers, progress.part(0.3, 1.0))
     # In another shape than the rod: which results depends on the path.
-    troubles = [one.trouble or (TWO_SHAPES if one.target < len(field.states) - 1 and np.abs(
-        one.shape[3:] - field.shapes[1 + one.target].ravel()).max() > _OTHER_SHAPE * field.length
-        else None) for one in solved]
-    good = [taken(grasp_model, grasp_model.rest), *(
-        one for one, why in zip(solved, troubles, strict=True) if not why)]
+    troubles = [one.trouble or (TWO_SHAPES if one.target < len(field.states) - 1 and is_other_shape(
+        grasp_model, one.state, field.shapes[1 + one.target].ravel()) else None) for one in solved]
+    good = (one.state for one, why in zip(solved, troubles, strict=True) if not why)
+    samples = States.of(grasp_model, [grasp_model.rest], sloped=True).joined(*good)
     rejected = np.concatenate([asked[[why is not None for why in troubles]], field.bistable])
     reasons = Counter([*(str(why) for why in troubles if why), *[TWO_SHAPES] * len(field.bistable)])
-    return Sampled(samples_of(good, rejected), [one.displacement for one in good], energy_surface,
-                   dict(sorted(reasons.items())), int((~slack).sum()))
+    return Sampled(replace(samples, rejected_poses=np.pad(rejected, [(0, 0), (0, 3)])),
+                   energy_surface, dict(sorted(reasons.items())), int((~slack).sum()))
+
+
+def is_other_shape(grasp_model: GraspModel, state: States, foretold: np.ndarray) -> bool:
+    """Return whether tip and targets of the one ``state`` are not where they were ``foretold``."""
+    off = np.abs(state.shape[0, 3:] - foretold).max()
+    return bool(off > _OTHER_SHAPE * grasp_model.reach.arc_length)
 
 
 def _slack(forces: np.ndarray, walked: np.ndarray) -> np.ndarray:
@@ -336,16 +340,15 @@ def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def solve_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int | None = None,
-                 progress: Progress = SILENT) -> tuple[list[Solved], list[Solved]]:
-    """Return the full model's accepted solutions, the rest state first, and refused ones."""
+                 progress: Progress = SILENT) -> tuple[list[Solution], list[Solution]]:
+    """Return the full model's accepted solutions and refused ones."""
     reached = grown(grasp_model.rod, targets, [grasp_model.rod.rest], progress.part(0.0, 0.1))
-    solved = _solved(grasp_model, targets, reached, workers, progress.part(0.1, 1.0))
-    return ([taken(grasp_model, grasp_model.rest), *(one for one in solved if not one.trouble)],
-            [one for one in solved if one.trouble])
+    solved = solved_from(grasp_model, targets, reached, workers, progress.part(0.1, 1.0))
+    return ([one for one in solved if not one.trouble], [one for one in solved if one.trouble])
 
 
-def _solved(grasp_model: GraspModel, targets: np.ndarray, states: Sequence[RodState | None],
-            workers: int | None, progress: Progress) -> list[Solved]:
+def solved_from(grasp_model: GraspModel, targets: np.ndarray, states: Sequence[RodState | None],
+            workers: int | None, progress: Progress) -> list[Solution]:
     """Return the full model's solutions at ``targets``, where the rod is in ``states``."""
     if len(targets) * grasp_model.mesh.tet_count < _FEW:
         workers = workers or 1
@@ -402,11 +405,11 @@ def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
                                f"({position}) m.", "This pose is a sample of the energy field and "
                                "had a solution before.", "Run ", Command("energy"), " again with ",
                                Option("force", True), ".").at(positions[bad[0].target])
-    return np.array([one.displacement for one in good[1:]])
+    return np.array([one.state.displacements[0] for one in good])
 
 
 def _solve_share(grasp_model: GraspModel, targets: np.ndarray, states: Sequence[RodState | None],
-                 numbers: np.ndarray, progress: Progress = SILENT) -> list[Solved]:
+                 numbers: np.ndarray, progress: Progress = SILENT) -> list[Solution]:
     """Solve ``targets`` from the rod's states there, from rest where there is none or it leads
     nowhere."""
     solved = []
@@ -415,7 +418,8 @@ def _solve_share(grasp_model: GraspModel, targets: np.ndarray, states: Sequence[
         result = None if state is None else grasp_model.confirm(state)
         if result is None or refusal(result):
             result = grasp_model.follow(position[None], grasp_model.rest.displacement)[0]
-        solved.append(taken(grasp_model, result, int(numbers[number])))
+        solved.append(Solution(int(numbers[number]), refusal(result),
+                               States.of(grasp_model, [result], sloped=True)))
     return solved
 
 

@@ -1,27 +1,28 @@
-"""The stored state of the branch at one grasp position, and samples from such states."""
+"""States of the branch at poses of its grasp: one record for samples, paths and checks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from limber.mechanics import StaticResult
 from limber.mechanics.statics.result import Status
-from limber.planning.field.grasp_model import GraspModel, refusal
-
-# What the branch model found at grasp poses: the samples of an energy field.
+from limber.planning.field.grasp_model import GraspModel
 
 LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
 """Loads of a pose besides energy and force: largest strain and stress [Pa] by magnitude; the
 gripper's force along the branch [N], outward positive, and its torque [Nm]; closeness of the branch
 to an obstacle, 1 where it touches one. A plan's constraints may add more.
 """
+Known = Any
+"""An array, or None where it is not known."""
+_NO_POSES = np.empty((0, 6))
 
 
 @dataclass(frozen=True)
-class GraspSamples:
-    """Results of the branch model at ``m`` accepted grasp poses, rest pose first.
+class States:
+    """Accepted states of the branch at ``m`` poses; of a field's samples the rest pose first.
 
     Attributes:
         poses: Position [m] and natural rotation vector of the grasped piece [rad], [m, 6].
@@ -38,6 +39,9 @@ class GraspSamples:
         shape_slopes: Slopes of natural rotation, tip and targets to the grasp's position, shape
             [m, 3, 6 + 3 targets].
         axial_forces: Component of the force along the branch at the grasp, outward [N], shape [m].
+        solved: Whether the full model was solved there, bool [m], or an earlier solution was
+            corrected (:mod:`limber.planning.field.other_modulus`); not known: it was.
+        displacements: Of all nodes [m], shape [m, node_count, 3]; in no file.
         added: Quantities of a plan's constraints, by their names, shape [m] each; in no file.
     """
 
@@ -46,15 +50,38 @@ class GraspSamples:
     forces: np.ndarray
     tips: np.ndarray
     min_det_f: np.ndarray
-    rejected_poses: np.ndarray
-    strains: np.ndarray | None
-    targets: np.ndarray | None = None
-    torques: np.ndarray | None = None
-    strain_places: np.ndarray | None = None
-    stresses: np.ndarray | None = None
-    shape_slopes: np.ndarray | None = None
-    axial_forces: np.ndarray | None = None
+    rejected_poses: np.ndarray = field(default_factory=_NO_POSES.copy)
+    strains: Known = None
+    targets: Known = None
+    torques: Known = None
+    strain_places: Known = None
+    stresses: Known = None
+    shape_slopes: Known = None
+    axial_forces: Known = None
+    solved: Known = None
+    displacements: Known = None
     added: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, grasp_model: GraspModel, results: Sequence[StaticResult], *, sloped: bool = False,
+           ) -> "States":
+        """Return the states of solutions, with slopes if ``sloped``; none are pulled at rest."""
+        moved = [one.displacement for one in results]
+        held = np.array([one is not grasp_model.rest for one in results])
+        forces = held[:, None] * [one.reaction_force for one in results]
+        strains, places, stresses = zip(*map(grasp_model.peak_load, moved), strict=True)
+        return cls(
+            np.array([grasp_model.pose(u) for u in moved]),
+            np.where(held, [grasp_model.energy(one) for one in results], 0.0), forces,
+            np.array([grasp_model.tip(u) for u in moved]),
+            np.array([float(one.min_det_f) for one in results]), strains=np.array(strains),
+            targets=np.array([grasp_model.branch.target_positions(u) for u in moved]),
+            torques=held[:, None] * [one.reaction_torque for one in results],
+            strain_places=np.array(places), stresses=np.array(stresses),
+            shape_slopes=np.array([grasp_model.shape_slopes(u) for u in moved]) if sloped else None,
+            axial_forces=np.array([grasp_model.axial_force(u, force)
+                                   for u, force in zip(moved, forces, strict=True)]),
+            solved=held | True, displacements=np.array(moved))
 
     @property
     def positions(self) -> np.ndarray:
@@ -65,88 +92,57 @@ class GraspSamples:
         """Natural rotation, tip and targets, shape [m, 6 + 3 targets]."""
         known = [self.poses[:, 3:], self.tips]
         if self.targets is not None:
-            known.append(self.targets.reshape(len(self.poses), -1))
+            known.append(self.targets.reshape(len(self.poses), 3 * self.targets.shape[1]))
         return np.hstack(known)
 
     @property
-    def loads(self) -> dict[str, np.ndarray | None]:
+    def force_sizes(self) -> np.ndarray:
+        """Magnitude of the gripper's force [N], shape [m]."""
+        return np.linalg.norm(self.forces, axis=1)
+
+    @property
+    def loads(self) -> dict[str, Known]:
         """Loads by the names of ``LOADS`` and of added ones, shape [m] each; None if not known."""
         torque = None if self.torques is None else np.linalg.norm(self.torques, axis=1)
         known = (self.strains, self.stresses, self.axial_forces, torque, None)
         return dict(zip(LOADS, known, strict=True)) | self.added
 
     @property
+    def sizes(self) -> dict[str, np.ndarray]:
+        """The quantities that may have limits, by name, as far as known, shape [m] each."""
+        return {"energy": self.energies, "force": self.force_sizes,
+                **{name: np.abs(one) for name, one in self.loads.items() if one is not None}}
+
+    @property
     def load_table(self) -> np.ndarray:
-        """The same as columns, shape [m, loads]; 0 if not known."""
+        """The loads as columns, shape [m, loads]; 0 if not known."""
         nothing = np.zeros(len(self.poses))
         return np.column_stack([nothing if one is None else one for one in self.loads.values()])
 
-    def joined(self, other: "GraspSamples") -> "GraspSamples":
-        """Return these samples followed by those of ``other``."""
-        added = {name: np.concatenate([values, other.added[name]])
-                 for name, values in self.added.items()}
-        return replace(self, added=added, **{
-            name: np.concatenate([values, getattr(other, name)])
-            for name, values in vars(self).items()
-            if name != "added" and values is not None and getattr(other, name) is not None})
+    def joined(self, *others: "States") -> "States":
+        """Return these states followed by those of ``others``, with what all of them have."""
+        every = (self, *others)
 
-    def take(self, index: np.ndarray) -> "GraspSamples":
-        """Return the samples of ``index``; rejected poses stay."""
+        def column(values: list) -> Any:
+            return None if any(one is None for one in values) else np.concatenate(values)
+
+        return States(added={name: column([one.added[name] for one in every])
+                             for name in self.added}, **{
+            name: column([getattr(one, name) for one in every])
+            for name in vars(self) if name != "added"})
+
+    def take(self, index: np.ndarray) -> "States":
+        """Return the states of ``index``, in its order; rejected poses stay."""
         added = {name: values[index] for name, values in self.added.items()}
         return replace(self, added=added, **{
             name: values[index] for name, values in vars(self).items()
             if name not in ("added", "rejected_poses") and values is not None})
 
 
-@dataclass(frozen=True)
-class Solved:
-    """A solution as a sample of :class:`~.energy_field.GraspSamples`, asked at number ``target``
-    (-1: none). ``trouble`` is why not to trust it."""
+class Solution(NamedTuple):
+    """The one ``state`` found at the pose asked as number ``target``; ``trouble`` is why not to
+    trust it."""
 
     target: int
-    pose: np.ndarray
-    energy: float
-    force: np.ndarray
-    tip: np.ndarray
-    min_det_f: float
     trouble: Status | None
-    targets: np.ndarray
-    torque: np.ndarray
-    strain: float
-    strain_place: np.ndarray
-    stress: float
-    shape_slopes: np.ndarray
-    axial_force: float
-    displacement: np.ndarray
-
-    @property
-    def shape(self) -> np.ndarray:
-        """Natural rotation [rad], tip and targets [m] in one row, [6 + 3 targets]."""
-        return np.concatenate([self.pose[3:], self.tip, self.targets.ravel()])
-
-
-def taken(grasp_model: GraspModel, result: StaticResult, target: int = -1) -> Solved:
-    """Return the stored state of a solution."""
-    moved, at_rest = result.displacement, result is grasp_model.rest
-    strain, position, stress = grasp_model.peak_load(moved)
-    force = np.zeros(3) if at_rest else result.reaction_force
-    return Solved(
-        target, grasp_model.pose(moved), 0.0 if at_rest else grasp_model.energy(result),
-        force, grasp_model.tip(moved),
-        float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
-        np.zeros(3) if at_rest else result.reaction_torque, strain, position, stress,
-        grasp_model.shape_slopes(moved), grasp_model.axial_force(moved, force), moved)
-
-
-_OF_SOLUTIONS = {
-    "poses": "pose", "energies": "energy", "forces": "force", "tips": "tip",
-    "min_det_f": "min_det_f", "strains": "strain", "targets": "targets", "torques": "torque",
-    "strain_places": "strain_place", "stresses": "stress", "shape_slopes": "shape_slopes",
-    "axial_forces": "axial_force"}
-
-
-def samples_of(good: Sequence[Solved], rejected: np.ndarray) -> GraspSamples:
-    """Return samples of solutions, the rest state first; ``rejected`` positions [m], [q, 3]."""
-    columns: dict[str, Any] = {name: np.array([getattr(one, own) for one in good])
-                               for name, own in _OF_SOLUTIONS.items()}
-    return GraspSamples(rejected_poses=np.hstack([rejected, np.zeros_like(rejected)]), **columns)
+    state: States

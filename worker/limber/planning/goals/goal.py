@@ -17,7 +17,7 @@ from limber.planning.field.energy_field import (
     limited,
 )
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.path_on_full_model import SolvedPoses
+from limber.planning.field.stored_states import States
 from limber.planning.settings import PlanSettings
 
 # Regions of space as goals for a point on the branch.
@@ -198,15 +198,15 @@ class Goal(Protocol):
         """Return one representative grasp position of the region, the same for any seed, [3]."""
         ...
 
-    def missed_by(self, states: SolvedPoses) -> float:
+    def missed_by(self, states: States) -> float:
         """Return how far outside the goal the last state is [m]; inside: 0 or below."""
         ...
 
-    def drawn_in(self, states: SolvedPoses) -> "Goal":
+    def drawn_in(self, states: States) -> "Goal":
         """Return the goal to plan for next if the last state was the end of a plan."""
         ...
 
-    def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
+    def require_end(self, grasp_model: GraspModel, states: States) -> None:
         """Raise NoPathError if the last state is in the region and is not valid."""
         ...
 
@@ -215,7 +215,7 @@ class Goal(Protocol):
         ``tolerance_m``, a ball in it."""
         ...
 
-    def describe_end(self, states: SolvedPoses) -> dict[str, Any]:
+    def describe_end(self, states: States) -> dict[str, Any]:
         """Return the plan summary's entries about the last state, as plain data."""
         ...
 

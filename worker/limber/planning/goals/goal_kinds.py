@@ -11,6 +11,7 @@ from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import solve_branch
+from limber.planning.field.stored_states import States
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import (
     NEARER,
@@ -27,7 +28,6 @@ from limber.planning.goals.goal import (
     empty_along,
     position_text,
 )
-from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
 
 # The grasp at a position: ``--goal``.
@@ -61,20 +61,20 @@ class GraspGoal:
     def centre(self, field: EnergyField) -> np.ndarray:
         return np.array(self.position, float)
 
-    def missed_by(self, states: SolvedPoses) -> float:
+    def missed_by(self, states: States) -> float:
         return float(np.linalg.norm(states.poses[-1, :3] - self.position)) - self.tolerance
 
-    def drawn_in(self, states: SolvedPoses) -> "GraspGoal":
+    def drawn_in(self, states: States) -> "GraspGoal":
         return self
 
-    def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
+    def require_end(self, grasp_model: GraspModel, states: States) -> None:
         pass
 
     def describe(self) -> dict:
         return {"kind": "grasp", "position_m": list(map(float, self.position)),
                 "tolerance_m": self.tolerance}
 
-    def describe_end(self, states: SolvedPoses) -> dict:
+    def describe_end(self, states: States) -> dict:
         return {}
 
 
@@ -215,21 +215,21 @@ class TargetGoal:
         points = trusted if len(trusted) else points
         return points[np.argmin(self.distance(field, points))]
 
-    def target_position(self, states: SolvedPoses) -> np.ndarray:
+    def target_position(self, states: States) -> np.ndarray:
         """Return the target's position in the last state [m], shape [3]."""
         return states.tips[-1] if self.target is None else states.targets[-1, self.target]
 
-    def missed_by(self, states: SolvedPoses) -> float:
+    def missed_by(self, states: States) -> float:
         """Return how far outside the region the target is in the last state [m]; inside: below 0.
         """
         return float(self.region.distance(self.target_position(states)[None])[0])
 
-    def drawn_in(self, states: SolvedPoses) -> Self:
+    def drawn_in(self, states: States) -> Self:
         """Return the goal moved inwards by the last state's distance from it, at most half."""
         missed = max(self.missed_by(states), 0.0)
         return replace(self, inset=min(self.inset + 1.5 * missed, 0.5 * self.tolerance))
 
-    def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
+    def require_end(self, grasp_model: GraspModel, states: States) -> None:
         pass
 
     def describe(self) -> dict:
@@ -237,7 +237,7 @@ class TargetGoal:
                 "position_m": self.region.middle.tolist(), "tolerance_m": self.tolerance,
                 "region": self.region.describe()}
 
-    def describe_end(self, states: SolvedPoses) -> dict:
+    def describe_end(self, states: States) -> dict:
         return {"target_end_m": self.target_position(states)}
 
 
@@ -411,14 +411,14 @@ class CellGoal(TargetGoal):
             return np.full(len(points), np.inf)
         return super().uncertainty(field, points)
 
-    def drawn_in(self, states: SolvedPoses) -> Self:
+    def drawn_in(self, states: States) -> Self:
         positions = states.tips if self.target is None else states.targets[:, self.target]
         found = super().drawn_in(states)._asked(states.poses[:, :3], positions,
                                                 states.displacements)
         ends = bool(self._cause(positions[-1], states.displacements[-1]))
         return replace(found, caution=found.caution * (_WARIER if ends else 1.0))
 
-    def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
+    def require_end(self, grasp_model: GraspModel, states: States) -> None:
         self.cell_place.require(self.what, self.target_position(states),
                                 self._surface(states.displacements[-1]))
 
@@ -468,18 +468,18 @@ class CellGoal(TargetGoal):
         if not len(inside):
             return self
         chosen = inside[_far_apart(samples.positions[inside], _SOLVED)]
-        states = solve_branch(self.grasp_model, samples.positions[chosen], workers=1)[0][1:]
-        which = [chosen[one.target] for one in states]
-        found = self._asked(samples.positions[which], positions[which],
-                            np.array([one.displacement for one in states]))
+        found = solve_branch(self.grasp_model, samples.positions[chosen], workers=1)[0]
+        which = [chosen[one.target] for one in found]
+        asked = self._asked(samples.positions[which], positions[which],
+                            np.array([one.state.displacements[0] for one in found]))
 
         def causes_at(middle: np.ndarray) -> list[str]:
             causes = ["the branch has no equilibrium there"] * len(middle)
-            for one in solve_branch(self.grasp_model, middle, workers=1)[0][1:]:
-                place = one.tip if self.target is None else one.targets[self.target]
-                causes[one.target] = self._cause(place, one.displacement)
+            for one in solve_branch(self.grasp_model, middle, workers=1)[0]:
+                causes[one.target] = self._cause(self.target_position(one.state),
+                                                 one.state.displacements[0])
             return causes
-        return found._sharpened(causes_at, _SOLVED_PAIRS, _SOLVED_HALVINGS)
+        return asked._sharpened(causes_at, _SOLVED_PAIRS, _SOLVED_HALVINGS)
 
     def _asked(self, grasps: np.ndarray, positions: np.ndarray, moved: np.ndarray | None) -> Self:
         """Return the goal with poses [n, 3] added that have the target at ``positions`` [n, 3]; the

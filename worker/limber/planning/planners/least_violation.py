@@ -15,7 +15,6 @@ from scipy.sparse.csgraph import dijkstra
 
 from limber.planning.cost import resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays, limited
-from limber.planning.field.radial import slacks_at
 from limber.planning.goals.goal import Goal
 
 _ALONG, _ACROSS = 64, 48  # grid points along the surface in each direction, and across it
@@ -81,11 +80,8 @@ def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.n
     within &= ((points >= limits.low) & (points <= limits.high)).all(axis=1)
     inside = points[within]
     shares = np.where(field.region.contains(inside), 0.0, _REFUSED)
-    places = field.region.chart.plain.map(inside)
-    names = ("energy", "force", *field.load_names)
     for one in limited(field, limits):
-        size = one.size(inside) + slacks_at(places, names.index(one.name), limits.slack)
-        shares = np.maximum(shares, size / one.limit)
+        shares = np.maximum(shares, one.share(inside))
     out[within] = shares
     return out
 

@@ -26,8 +26,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify_all
 from limber.planning.cost import EdgeWeights, arc_lengths, edge_cost, path_cost, resample
-from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.field.radial import slack_slopes, slacks_at
+from limber.planning.field.energy_field import EnergyField, FieldArrays, Quantity, limited
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.path_problem import BlockedError, GentleProblem, no_path_error, not_found
 from limber.planning.planners.least_violation import easiest_path
@@ -147,7 +146,7 @@ def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]
     """Return the path [n, 3] at the nearest optimum, its end within the goal, and its cost:
     infinite, with the given path, if no allowed one was found near."""
     best, least, moved = path, problem.cost(path), path
-    limits = Limited(problem, 0.0)
+    limits = Excesses(problem, 0.0)
     for margin, following in zip(_MARGINS, (*_MARGINS[1:], 0.0), strict=True):
         limits.margin = margin
         moved, over = _moved(moved, limits)
@@ -176,7 +175,7 @@ def distinct(paths: Sequence[np.ndarray]) -> list[np.ndarray]:
     return found
 
 
-def _moved(path: np.ndarray, limits: "Limited") -> tuple[np.ndarray, float]:
+def _moved(path: np.ndarray, limits: "Excesses") -> tuple[np.ndarray, float]:
     """Move a path [n, 3] to keep the margin from ``limits``, whose multipliers go on; and its
     largest excess over a limit, relative to it."""
     line = _Line(limits.problem)
@@ -212,7 +211,7 @@ class _Line:
         both[::2], both[1::2] = flat, 0.5 * (flat[1:] + flat[:-1])
         return self.chart.curved(both)
 
-    def settle(self, flat: np.ndarray, limits: "Limited") -> tuple[np.ndarray, float]:
+    def settle(self, flat: np.ndarray, limits: "Excesses") -> tuple[np.ndarray, float]:
         """Move corners to the minimum of the augmented Lagrangian; and its cost. Unknowns are
         edges, so a step moves whole parts as lightly as a corner (a chain of springs)."""
         edges = np.diff(flat, axis=0)
@@ -255,14 +254,8 @@ def _along(outward: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     return lambda push: push[:, None] * outward
 
 
-def _load_slope(known: EnergyField, name: str, load: np.ndarray, points: np.ndarray,
-                active: np.ndarray) -> np.ndarray:
-    """Slope of a load's size at the points with the indices ``active``, shape [k, 3]."""
-    return np.sign(load[active])[:, None] * known.load_gradient(points[active], name)
-
-
 @dataclass
-class Limited:
+class Excesses:
     """The limits on a path's points and their multipliers. Points within ``margin`` [m] of trust's
     border, and an end off the goal, are over; energy, force and length are relative."""
 
@@ -341,51 +334,14 @@ class Limited:
             yield self._on_length(points)
 
     def _on_loads(self, points: np.ndarray) -> Iterator[_Excess]:
-        """Yield the excess of energy, loads and force at each point."""
-        known, limits, reserve = self.problem.energy_field, self.problem.limits, self.reserve
-
-        def excess(values: np.ndarray, limit: float, row: int,
-                   slope: Callable[[np.ndarray], np.ndarray]) -> _Excess:
-            """Compute the slopes [k, 3] only at the points where the limit acts."""
-            def pull(push: np.ndarray) -> np.ndarray:
-                out, active = np.zeros_like(points), np.flatnonzero(push)
-                rise = slope(active) + self._slack_slope(points[active], row)
-                out[active] = push[active, None] * rise / limit
-                return out
-            return _Excess((values + self._slack(points, row)) / limit - 1.0 + reserve, pull,
-                           _WEIGHTS[1])
-        if limits.max_energy < np.inf:
-            yield excess(known.energy(points), limits.max_energy, 0,
-                         lambda active: known.energy_gradient(points[active]))
-        for row, (name, limit) in enumerate(zip(known.load_names, limits.max_loads, strict=True)):
-            if limit < np.inf:
-                load = known.load(points, name)
-                yield excess(np.abs(load), limit, 2 + row,
-                             partial(_load_slope, known, name, load, points))
-        if limits.max_force < np.inf:
-            force = known.force(points)
-            size = np.linalg.norm(force, axis=1)
-
-            def stiffness(active: np.ndarray) -> np.ndarray:
-                # The Hessian times F / |F|: one difference along the force.
-                step = _STEP * force[active] / np.maximum(size[active], 1e-12)[:, None]
-                return (known.force(points[active] + step) - known.force(points[active] - step)) / (
-                    2.0 * _STEP)
-            yield excess(size, limits.max_force, 1, stiffness)
-
-    def _slack(self, points: np.ndarray, row: int) -> np.ndarray:
-        """Return by how much a limit is tighter at ``points`` [n, 3], shape [n]."""
-        slack = self.problem.limits.slack
-        if slack.factors[row] == 0.0:
-            return np.zeros(len(points))
-        return slacks_at(self.problem.energy_field.region.chart.plain.map(points), row, slack)
-
-    def _slack_slope(self, points: np.ndarray, row: int) -> np.ndarray:
-        if self.problem.limits.slack.factors[row] == 0.0:
-            return np.zeros((len(points), 3))
-        chart = self.problem.energy_field.region.chart.plain
-        return chart.pull_back(points, slack_slopes(
-            chart.map(points), row, self.problem.limits.slack))
+        """Yield the excess of energy, loads and force at each point; slopes are computed only where
+        a limit acts."""
+        def pull(one: Quantity, push: np.ndarray) -> np.ndarray:
+            out, active = np.zeros_like(points), np.flatnonzero(push)
+            out[active] = push[active, None] * one.slope(points[active]) / one.limit
+            return out
+        for one in limited(self.problem.energy_field, self.problem.limits):
+            yield _Excess(one.share(points) - 1.0 + self.reserve, partial(pull, one), _WEIGHTS[1])
 
     def _at_end(self, points: np.ndarray, push: np.ndarray) -> np.ndarray:
         shifts = _STEP * np.concatenate([np.eye(3), -np.eye(3)])

@@ -290,9 +290,8 @@ class PlanPaths(PlanSettings, Repeatable, PlacedStage):
                      Command("energy"), " ran."),
                 "Run ", Command("energy"), " again.")
         grasp_model = grasp_model.damped(known_damping(branch))
-        digests = digests | {"damping": repr(grasp_model.model.damping)}
         stiffer = _stiffer(branch) if self.max_stress else 1.0
-        digests = digests | {"stiffer": f"{stiffer:.6f}"}
+        digests |= {"damping": repr(grasp_model.model.damping), "stiffer": f"{stiffer:.6f}"}
         strength = strength_for(branch, self, self.break_tests)
         if self.break_tests is not None:
             digests = digests | {"break tests": file_digest(self.break_tests)}
@@ -300,9 +299,8 @@ class PlanPaths(PlanSettings, Repeatable, PlacedStage):
         asked = with_damage(Limits.of(self, stiffer), self, strength, young)
         if np.isfinite(asked.strain):
             digests = digests | {"strain": f"{asked.strain:.6g}"}
-        uncertainty = (
-            None if self.confidence is None else young_uncertainty(branch, grasp_model, asked)
-        )
+        uncertainty = None if self.confidence is None else young_uncertainty(
+            branch, grasp_model, asked)
         if self.turn_slack is not None and self.cell is None:
             raise InputError(Text(Option("turn_slack"), " is given without ", Option("cell"), "."),
                              "It is the arm in the cell that may not let the gripper turn with the "
@@ -320,9 +318,8 @@ class PlanPaths(PlanSettings, Repeatable, PlacedStage):
             in_cell.check_goal(self)
         with branch.stage(key, self, reads=reads, digests=digests) as stage:
             limits = asked if in_cell is None else in_cell.limits
-            pace = Pace(self.speed)
-            if in_cell is not None:
-                pace = in_cell.slowed(pace, progress)
+            pace = Pace(self.speed) if in_cell is None else in_cell.slowed(
+                Pace(self.speed), progress)
             try:
                 found = plan_motion(
                     field,

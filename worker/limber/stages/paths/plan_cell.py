@@ -22,9 +22,9 @@ from limber.mechanics.sensitivities import grasp_slopes
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import Ball, CellPlace, position_text
 from limber.planning.goals.goal_kinds import View
-from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import PlanPath
 from limber.robot.depth_camera import LiveView
 from limber.robot.motion.execution import (
@@ -285,7 +285,7 @@ class Clamped:
     cost: TurnCost
 
     @classmethod
-    def of(cls, grasp_model: GraspModel, states: SolvedPoses) -> "Clamped":
+    def of(cls, grasp_model: GraspModel, states: States) -> "Clamped":
         """Solve the clamped branch at some of a plan's states; NoPathError if one has no
         solution."""
         grasp = Grasp.gripping(grasp_model.mesh, grasp_model.grasp.centre, GRASP_RADIUS_M)
@@ -332,7 +332,7 @@ def _solved(firm: BranchModel, grasp: Grasp, pose: np.ndarray, begin: np.ndarray
     return found
 
 
-def turned_by(cell: Cell, predicted: Predicted, grasp_model: GraspModel, states: SolvedPoses,
+def turned_by(cell: Cell, predicted: Predicted, grasp_model: GraspModel, states: States,
               slack: float, limits: Limits, **asked: Any) -> tuple[Turned, dict[str, Any]]:
     """Return the robot's motion with the gripper turned by at most ``slack`` [rad] beyond the
     branch's own rotation, checked on the full model, its torque below the guard's stop, and a
