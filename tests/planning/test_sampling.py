@@ -13,6 +13,7 @@ from limber.mechanics import Grasp, solve_static
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import Reach
+from limber.planning.field.other_modulus import with_modulus
 from limber.planning.field.sampling import (
     LowEnergySurface,
     RodField,
@@ -112,6 +113,28 @@ def test_firm_grasp_at_the_natural_rotation_costs_no_more(small_model, some):
                             pose=small_model.pose(loose.displacement), start=loose.displacement)
         assert held.converged
         assert small_model.energy(held) == pytest.approx(small_model.energy(loose), rel=0.02)
+
+
+@pytest.mark.slow
+def test_states_with_another_modulus_are_those_of_the_full_model(small_mesh, small_skeleton):
+    """Stiffer by a half at the base and softer at the tip, under weight: what is not solved is
+    nearly what a solution gives."""
+    before = small_grasp_model(small_mesh, small_skeleton, (0.0, 0.0, -9.80665))
+    targets = sample_positions(
+        before.reach, before.rest_position, 64,
+        LowEnergySurface(before.reach.base, before.reach.chord), deflection=0.3)
+    known = fit_field(sample_branch(before, targets)[0], before.reach.base)
+    young = before.model.young * np.interp(small_mesh.centroids[:, 2], [0.0, 0.5], [1.5, 0.8])
+    after = replace(before, branch=before.branch.with_young(young))
+    found = with_modulus(known, before, after).samples
+    guess = found.take(~found.solved)
+    truth = sample_branch(after, guess.positions)[0].take(np.arange(1, 17))
+    assert found.energies[0] == 0.0 and len(guess.poses) == 16 == len(found.poses) - 49
+    np.testing.assert_allclose(guess.energies, truth.energies, rtol=0.01)
+    np.testing.assert_allclose(guess.forces, truth.forces, atol=0.01 * truth.force_sizes.max())
+    np.testing.assert_allclose(guess.tips, truth.tips, atol=1e-3)
+    np.testing.assert_allclose(guess.poses, truth.poses, atol=0.02)
+    np.testing.assert_allclose(guess.strains, truth.strains, rtol=0.05)
 
 
 @pytest.mark.slow

@@ -47,9 +47,8 @@ class EnergyField(Result):
         from limber.planning.field import energy_field
 
         field = energy_field.EnergyField.read(branch.path("energy.npz"))
-        samples = field.samples
-        return {"field": field, "positions": frozen(samples.positions),
-                "energies": frozen(samples.energies), "forces": frozen(samples.forces)}
+        return {"field": field, **{name: frozen(getattr(field.samples, name))
+                                   for name in ("positions", "energies", "forces")}}
 
     def energy(self, points: np.ndarray) -> np.ndarray:
         """Return the energy [J] with the grasp at ``points`` [m], shape [n, 3]; shape [n]."""
@@ -78,6 +77,7 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
             WorkError: too few poses could be solved.
         """
         from limber.planning.field.energy_field import fit_field
+        from limber.planning.field.other_modulus import corrected_field, material_of
         from limber.planning.field.sampling import energy_inputs, sample_field
         from limber.store.loading import load_grasp_model
 
@@ -87,35 +87,38 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
         digests = energy_inputs(grasp_model)
         if self.is_kept(branch, digests=digests):
             return branch.manifest.stages["energy"].result
+        earlier = branch.manifest.stages.get("energy")
         with branch.stage("energy", self, digests=digests) as stage:
-            count = self.samples
-            while True:
+            field, told, count = None, dict[str, Any](), self.samples
+            if earlier and self.is_kept(branch, digests=digests | {
+                    "material": earlier.reads.get("material", "")}):
+                field = corrected_field(branch.path("energy.npz"), grasp_model, progress)
+            asked = 0.01 * (self.field_error or np.inf)
+            while field is None or (field.errors["energy_error"] > asked
+                                    and count <= _MOST_TIMES * self.samples):
                 sampled = sample_field(grasp_model, self.model_copy(update={"samples": count}),
                                        progress=progress.part(0.0, 0.8))
                 field = fit_field(sampled.samples, sampled.energy_surface.pivot,
                                   sampled.energy_surface.radius, progress=progress.part(0.8, 1.0))
-                off, asked = 100.0 * field.errors["energy_error"], self.field_error or np.inf
-                if off <= asked or count >= _MOST_TIMES * self.samples:
-                    break
+                told = {"rejected_reasons": sampled.reasons, "taut_count": sampled.taut_count}
                 count *= 2
-            if off > asked:
+            if field.errors["energy_error"] > asked:
                 progress.warn(
-                    f"The error of the energy field is {off:.2g} % with "
-                    f"{len(field.samples.poses)} poses, more than the {asked:g} % of ",
+                    f"The error of the energy field is {100 * field.errors['energy_error']:.2g} % "
+                    f"with {len(field.samples.poses)} poses, more than the {100 * asked:g} % of ",
                     Option("field_error"), ". Increase ", Option("samples"), ", or reduce ",
                     Option("deflection"), ".")
-            samples, reasons = sampled.samples, sampled.reasons
-            rejected = len(samples.rejected_poses)
+            samples, rejected = field.samples, len(field.samples.rejected_poses)
             if rejected > 0.2 * self.samples:
-                progress.warn(f"{rejected} of {self.samples} poses were rejected ({reasons}). "
-                              "Paths avoid them.")
+                progress.warn(f"{rejected} of {self.samples} poses were rejected "
+                              f"({told.get('rejected_reasons')}). Paths avoid them.")
             field.write(stage.path("energy.npz"), {
                 "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
                 "rest_pose": samples.poses[0], "chart_base_m": grasp_model.reach.base,
-                "arc_length_m": np.array(grasp_model.reach.arc_length)})
+                "arc_length_m": np.array(grasp_model.reach.arc_length),
+                "material": material_of(grasp_model)})
             stage.result.update(
-                sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
-                taut_count=sampled.taut_count,
+                sample_count=len(samples.poses), rejected_count=rejected, **told,
                 energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
                 errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
                 chart_stretch=field.chart.stretch,
