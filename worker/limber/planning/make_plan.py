@@ -383,8 +383,7 @@ class _Rounds:
             return False
         self.holding = {"pair": pair, "plan": plan, "moving": self.moving, "risks": self.risks[:]}
         states = plan.solved.take(np.arange(len(plan.solved.poses))[::-_LAST_EVERY][:_LAST])
-        self.field = refit(self.field, as_samples(self.grasp_model, states, self.field.samples,
-                                                  self.limits))
+        self.field = refit(self.field, as_samples(self.grasp_model, states, self.limits))
         return True
 
     def _planned(self, ahead: Progress, is_last: bool) -> PathPair | None:

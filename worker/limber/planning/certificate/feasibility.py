@@ -266,9 +266,9 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
         along = cells.chart.push_forward(positions, slopes) * cells.edges
         least, bends = _least(values[nodes], along[nodes])
         spare = cells.problem.spare(one.name, positions)[nodes[:, _AT]].min(axis=1)
-        limit = one.smooth_limit(spare)
-        over |= least > limit
-        uncertainty = np.maximum(uncertainty, bends / limit[:, None])
+        most = one.smooth_limit(spare)
+        over |= least > most
+        uncertainty = np.maximum(uncertainty, bends / most[:, None])
     limit = cells.problem.sure_limits.max_force
     if limit < np.inf:
         spare = cells.problem.spare("force", positions)[nodes[:, _AT]].min(axis=1)
