@@ -197,7 +197,7 @@ class CellErrors:
         """Change of a simulated pull ``index`` by all errors, each in its deviations."""
         forward = self._forwards[index]
         positions, frames = simulated.positions, forward.frames
-        total = Simulated.none(*positions.shape[:2], self.count)
+        total = Simulated.none(len(frames), positions.shape[1], self.count)
         first = self._first[calibration_of(forward.entry)]
         pull = _Pull(forward.entry, frames, np.array(first.entry.grasp.point_m), first.rest_points,
                      forward.grasp_tangent, forward.point_directions, positions,

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -350,19 +351,22 @@ class Simulated:
     @classmethod
     def none(cls, frames: int, points: int, unknowns: int) -> "Simulated":
         """Return no change of any measurement by some unknowns."""
-        change = (np.zeros((frames, 3, unknowns)) for _ in range(3))
-        return cls(np.zeros((frames, points, 3, unknowns)), *change)
+        force, torque, grasp = np.zeros((3, frames, 3, unknowns))
+        return cls(np.zeros((frames, points, 3, unknowns)), force, torque, grasp)
 
     def each(self, changed: Callable[[np.ndarray], np.ndarray]) -> "Simulated":
         """Return all of it, and its slopes, changed."""
-        return Simulated(*(None if values is None else values.each(changed) if isinstance(
-            values, Simulated) else changed(values) for values in vars(self).values()))
+        kept: dict[str, Any] = {
+            name: values.each(changed) if isinstance(values, Simulated) else changed(values)
+            for name, values in vars(self).items() if values is not None}
+        return Simulated(**kept)
 
     def moved(self, slopes: "Simulated", step: np.ndarray) -> "Simulated":
         """Return the pull after a small change [P] of the unknowns of these slopes, to first
         order; it has none."""
-        return Simulated(*(None if values is None else values + getattr(slopes, name) @ step
-                           for name, values in vars(self).items() if name != "slopes"))
+        kept: dict[str, Any] = {name: values + getattr(slopes, name) @ step for name, values
+                                in vars(self).items() if isinstance(values, np.ndarray)}
+        return Simulated(**kept)
 
 
 def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:

@@ -86,7 +86,7 @@ def _may_show(forward: Forward) -> bool:
 
 def _change(forces: np.ndarray, forward: Forward, seconds: float) -> Simulated:
     """Change of a pull's measurements by one prior deviation of the share."""
-    found = Simulated.none(*forward.frames.positions.shape[:2], 1)
+    found = Simulated.none(len(forces), forward.frames.positions.shape[1], 1)
     if _may_show(forward):
         found.forces[..., 0] = -CREEP_SIGMA * relaxed(forward.frames.times, forces, seconds)
     return found
