@@ -12,6 +12,7 @@ from limber.planning.constraints import damage
 from limber.planning.constraints.damage import DamageAlong, Strength, assumed, read_break_tests
 from limber.planning.constraints.limits import Limits
 from limber.planning.settings import PlanSpec
+from limber.results.findings import path_sentence
 from limber.results.report.figures import damage_along_branch
 from limber.stages.paths.plan import Plan
 from limber.stages.paths.plan_strength import (
@@ -140,6 +141,8 @@ def test_a_plan_over_its_strength_is_said_to_be():
     assert np.array_equal(unknown["grasp_m"], [6.0, 7.0, 8.0])
     rows = Plan.of({"baseline": {}, "plan": {}, "strength": over}).comparison()
     assert rows[-2][2] == "1.4" and rows[-1][0].startswith("probability of damage")
+    said = path_sentence({"plan": {"length_m": 0.1}, "strength": over})
+    assert said.startswith("The gentle path damages the branch with a probability of ")
 
 
 def test_the_branch_is_drawn_where_it_would_break(small_model, small_skeleton, tmp_path):

@@ -10,7 +10,6 @@ from limber.planning.constraints.damage import Strength, assumed
 from limber.results.findings import (
     beyond_sentence,
     certificate_sentence,
-    failure_sentence,
     modulus_origin,
     modulus_sentence,
     path_sentence,
@@ -100,7 +99,6 @@ def test_peaks_of_a_motion_stand_with_the_limits_that_they_exceed():
     assert peaks_line({"peak_strain": 0.004, "peak_force_n": 60.0}, "ur3e").endswith(
         "more than a UR3E carries (29 N).")
     assert peaks_line({"peak_strain": 0.004, "peak_force_n": 0.0}) == "Largest strain 0.4 %."
-    assert failure_sentence(1.2) == "There the wood fails." and not failure_sentence(1.0)
 
 
 def test_a_plan_over_the_strength_of_the_wood_says_so():

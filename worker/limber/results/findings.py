@@ -88,14 +88,16 @@ def plan_sentences(plan: Mapping[str, Any]) -> list[str]:
 
 
 def path_sentence(plan: Mapping[str, Any]) -> str:
-    """Return length, energy and force of the gentle path, and its savings, by a plan's summary."""
-    gentle = plan["plan"]
-    parts = [f"is {1e3 * gentle['length_m']:.3g} mm long"]
-    if gentle.get("peak_energy_j") is not None:
-        parts.append(f"stores at most {1e3 * gentle['peak_energy_j']:.3g} mJ")
-    if gentle.get("peak_force_n") is not None:
-        parts.append(f"needs at most {gentle['peak_force_n']:.3g} N")
-    sentence = "The gentle path " + _listed(parts)
+    """Return the probability that the gentle path damages the branch, as far as it is known, its
+    length, energy and force, and its savings, by a plan's summary."""
+    gentle, strength = plan["plan"], plan.get("strength") or {}
+    known = ((strength.get("damage_probability"), 100.0,
+              "damages the branch with a probability of {:.2g} %"),
+             (gentle["length_m"], 1e3, "is {:.3g} mm long"),
+             (gentle.get("peak_energy_j"), 1e3, "stores at most {:.3g} mJ"),
+             (gentle.get("peak_force_n"), 1.0, "needs at most {:.3g} N"))
+    sentence = "The gentle path " + _listed([
+        words.format(factor * value) for value, factor, words in known if value is not None])
     saved, added = plan.get("energy_saved_percent"), plan.get("length_added_percent")
     if saved is None or added is None:
         return f"{sentence}."
@@ -181,12 +183,6 @@ def peaks_line(peaks: Mapping[str, Any], model: str | None = None) -> str:
         parts.append(("peak force", f"{force:.3g} N", force_remark(force, model)))
     return "; ".join(f"{name} {value}" + (f", {remark}" if remark else "")
                      for name, value, remark in parts) + "."
-
-
-def failure_sentence(strain_over_limit: float) -> str:
-    """State that loads strain the wood beyond its failure strain, of which they reach this
-    multiple; empty if they do not."""
-    return "There the wood fails." if strain_over_limit > 1.0 else ""
 
 
 def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
