@@ -5,10 +5,18 @@ import numpy as np
 import pytest
 from tests.stages.specified import SpecifiedPull
 
+from limber.core.constants import GRAVITY
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotated
 from limber.estimation.settings import PullSpec, VirtualPullSettings
-from limber.estimation.simulated_pull import CellErrors, true_branch
+from limber.estimation.simulated_pull import (
+    DEFAULT_YOUNG_PA,
+    MOST_TURN,
+    CellErrors,
+    true_branch,
+    turn_by_weight,
+)
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.recording import (
     EXACT,
     CalibrationEntry,
@@ -84,6 +92,22 @@ def test_a_virtual_pull_states_what_was_drawn(branch_folder):
     assert abs(known["force_gain"] - 1) < 0.1 and np.linalg.norm(known["gripper_place_m"]) > 1e-4
     other = read_pull(branch_folder / "pulls" / "pull-1").entry
     assert other.calibration == EXACT and "cell_errors" not in other.truth
+
+
+def test_an_assumed_modulus_carries_the_branch():
+    """A lying cantilever: q L^3 / (6 E I) at its end. One that turns too far is stiffer."""
+    count, radius = 101, 0.01
+    for length in (0.4, 1.6):
+        rod = Skeleton.from_edges(np.linspace((0, 0, 0), (length, 0, 0), count),
+                                  np.arange(-1, count - 1), np.full(count, radius))
+        stiff = true_branch(rod, PullSpec(young=(1e8,) * 4))
+        turn = 4 * 900 * GRAVITY[2] * length**3 / (6 * 1e8 * radius**2)
+        assert turn_by_weight(stiff, 900.0) == pytest.approx(-turn, rel=0.02)
+        assumed = true_branch(rod, PullSpec(density=900.0))
+        ratio = assumed.young / DEFAULT_YOUNG_PA
+        assert np.ptp(ratio) == pytest.approx(0)
+        assert ratio[0] == 1.0 if length < 1 else ratio[0] > 1.5
+        assert turn_by_weight(assumed, 900.0) == pytest.approx(MOST_TURN) or ratio[0] == 1.0
 
 
 def test_each_branch_has_its_own_shape_and_cell(branch_folder, tmp_path, small, small_bench):

@@ -167,7 +167,8 @@ class VirtualPullSettings(Settings):
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
-        "generated branch, or a gradient from 160 to 40 MPa.")
+        "generated branch, or a gradient from 160 to 40 MPa, stiffer if the branch could not carry "
+        "itself.")
     model: Literal["tetrahedra", "rod"] = Field(
         "tetrahedra", description="tetrahedra: a finer mesh than the fit's. rod: a Cosserat rod of "
         "the true axes and radii, which shares no code with the fit's simulation. Only for slow "

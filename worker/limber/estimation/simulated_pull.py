@@ -128,6 +128,8 @@ BODY_LIMIT = 25_000
 SHAPE_TRIES = 8
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
+MOST_TURN = 0.2
+"""Turn of an end by the branch's own weight [rad] up to which an assumed modulus is taken."""
 
 _PULL_TURN = 2.0  # angle by which the direction of a pull turns [rad]: both bending axes are seen
 
@@ -159,9 +161,12 @@ class TrueBranch:
 def true_branch(skeleton: Skeleton, settings: PullSpec, *,
                 body: TetMesh | None = None, scan: np.ndarray | None = None,
                 fractions: tuple[float, ...] = FRACTIONS,
-                young: Sequence[float] = DEFAULT_YOUNG_PA,
+                young: Sequence[float] = (),
                 gravity: tuple[float, float, float] = GRAVITY, source: str = "") -> TrueBranch:
     """Return the branch of true axes, on a mesh of its own; the settings' moduli take precedence.
+
+    Without any moduli they are assumed: :data:`DEFAULT_YOUNG_PA`, or as many times stiffer as the
+    branch needs to carry itself.
 
     Args:
         body: Tetrahedra of a body that was meshed directly. It is then the truth, with each
@@ -188,8 +193,28 @@ def true_branch(skeleton: Skeleton, settings: PullSpec, *,
     if scan is not None and body is None:
         skeleton, mesh = _another(skeleton, mesh, scan, _drawing(source, 2))
     mesh = mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
-    return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
-                      np.array(young, float), gravity, is_meshed=body is not None, source=source)
+    found = TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
+                       np.array(young if len(young) else DEFAULT_YOUNG_PA, float), gravity,
+                       is_meshed=body is not None, source=source)
+    return found if len(young) else replace(
+        found, young=found.young * max(1.0, turn_by_weight(found, settings.density) / MOST_TURN))
+
+
+def turn_by_weight(branch: TrueBranch, density: float) -> float:
+    """The most that the weight of a branch turns one of its ends [rad], by beam theory."""
+    tree = branch.skeleton
+    steps = tree.steps
+    weight = density * np.pi * tree.radius**2 * steps
+    moment, turn = weight[:, None] * tree.nodes, np.zeros(tree.node_count)
+    for node in range(tree.node_count - 1, 0, -1):
+        weight[tree.parent[node]] += weight[node]
+        moment[tree.parent[node]] += moment[node]
+    bending = np.cross(moment - weight[:, None] * tree.nodes, branch.gravity)
+    stiffness = branch.young_at(tree.nodes) * np.pi * tree.radius**4 / 4
+    for node in range(1, tree.node_count):
+        turn[node] = turn[tree.parent[node]] + (
+            np.linalg.norm(bending[node]) / stiffness[node] * steps[node])
+    return float(turn.max())
 
 
 def _drawing(source: str, stream: int) -> np.random.Generator:

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 
 def _assumed_line(result: Mapping[str, Any]) -> str | None:
-    return ("Its modulus is assumed: it says nothing of the real branch."
-            if result.get("young_assumed") else None)
+    base, *_, tip = result["young_true_pa"]
+    return (f"Its modulus is assumed, {base / 1e9:.3g} to {tip / 1e9:.3g} GPa: it says nothing "
+            "of the real branch." if result["young_assumed"] else None)
 
 
 class VirtualPull(VirtualPullSettings, KeptStage, BranchStage):
