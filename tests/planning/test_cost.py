@@ -38,13 +38,6 @@ def test_division_of_an_edge_changes_nothing(ridge_field, cost_weights):
     assert np.ptp(costs) < 2e-3 * costs[0]
 
 
-def test_there_and_back_cost_the_same(ridge_field, cost_weights):
-    """Symmetric in direction, which rewiring relies on."""
-    field = ridge_field.limited()
-    assert edge_cost(START, GOAL, field, cost_weights.weights) == pytest.approx(
-        edge_cost(GOAL, START, field, cost_weights.weights), rel=1e-12)
-
-
 def test_limits_make_an_edge_infinite(ridge_field, cost_weights):
     """An edge over the ridge is refused by a limit on energy, and by one on force."""
     over = edge_cost(START, GOAL, ridge_field.limited(max_energy=0.2), cost_weights.weights)

@@ -8,6 +8,7 @@ import pytest
 from limber.core.progress import Progress
 from limber.planning import make_plan as planning
 from limber.planning.baseline_and_plan import plan_within
+from limber.planning.certificate.cells import Cells
 from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
@@ -100,6 +101,17 @@ def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
         return np.linalg.norm(ridge_field.force(resample(points, 0.001)), axis=1).max() / limit
     assert way.worst < 0.9 * worst(line) and way.worst < 1.03 * worst(free)
     assert np.linalg.norm(way.points[-1] - goal.position) <= goal.tolerance
+
+
+def test_a_level_is_the_least_at_which_cells_connect(ridge_field):
+    """By brute force: at any level the first cell connects to those whose level is no higher."""
+    cells = replace(Cells.over(ridge_field), numbers=np.argwhere(np.ones((4, 4, 4))))
+    heights = np.random.default_rng(2).permutation(64) + 1.0
+    found = cells.levels(heights, 5)
+    for level in heights[heights >= heights[5]]:
+        low = heights <= level
+        together = cells.take(low).connected(np.flatnonzero(low) == 5)
+        assert np.array_equal(found[low] <= level, together)
 
 
 @pytest.fixture

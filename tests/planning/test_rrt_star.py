@@ -126,12 +126,6 @@ def test_goal_out_of_reach_says_how_far(ridge_field):
         goal_points(far, ridge_field, ridge_field.limited())
 
 
-def test_goal_above_the_limit_says_so(ridge_field):
-    """A goal whose energy is over the cap is refused with both numbers."""
-    with pytest.raises(NoPathError, match="max-energy"):
-        goal_points(GOAL, ridge_field, ridge_field.limited(max_energy=0.01))
-
-
 def test_goal_behind_a_wall(ridge_field):
     """A cap that parts the start from the goal ends in NoPathError and not in a path."""
     problem = make_problem(ridge_field, deformation=0.0, distance=1.0)

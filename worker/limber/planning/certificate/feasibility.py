@@ -1,9 +1,7 @@
 """Whether a path exists, decided on cells along the low-energy surface.
 
-Off the shell, a force grows a hundred times as fast as along it. Cubic cells must therefore be tiny
-before they show that a limit is broken in all of them. Here cells are cut in the chart's
-coordinates (:mod:`limber.planning.field.chart`), along the undecided axes, and only
-where they are open. If open cells do not connect the start's cell to one that may contain a point
+Cells (:mod:`limber.planning.certificate.cells`) are cut along the undecided axes, and only where
+they are open. If open cells do not connect the start's cell to one that may contain a point
 of the goal, no path exists. If cells that keep all limits at their corners do, a path usually
 exists.
 
@@ -17,116 +15,20 @@ near as its error.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from limber.planning.certificate.cells import AT, BESIDE, Cells
 from limber.planning.certificate.subsolution import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
-from limber.planning.field.chart import Chart
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import allowed_points
 from limber.planning.path_problem import GentleProblem, least_over
 
-_ALONG, _ACROSS = 20, 40  # cells along the surface in each direction; across it
-_EVEN = 26  # cells in each direction without a surface
 _MOST_CELLS = 100_000  # most cells evaluated at once
 _DOUBTED = 0.5  # fraction of the most uncertain axis above which another axis is cut too
 _FINE = 0.001  # [m] between points of a path
 _MOST_NEAREST = 500  # of the reached cells, those nearest to the goal
 _NOWHERE = np.empty((0, 3))
-_WIDE = 1 << 20  # more cells than along any axis
-_CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-_STENCIL = np.unique(np.concatenate([_CORNERS + side * step for step in np.eye(3, dtype=int)
-                                     for side in (-1, 0, 1)]), axis=0)
-_AHEAD = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)
-                   if (i, j, k) > (0, 0, 0)])
-
-
-def _column(offset: np.ndarray) -> int:
-    return int(np.flatnonzero((offset == _STENCIL).all(axis=1))[0])
-
-
-_AT = np.array([_column(corner) for corner in _CORNERS])
-_BESIDE = np.array([[[_column(corner - step), _column(corner + step)] for corner in _CORNERS]
-                    for step in np.eye(3, dtype=int)])
-
-
-@dataclass(frozen=True)
-class _Cells:
-    """Cells ``numbers`` [n, 3]; corner ``k`` [3] is at ``low + k * edges`` in the plain chart."""
-
-    problem: GentleProblem
-    low: np.ndarray
-    edges: np.ndarray
-    numbers: np.ndarray
-
-    def take(self, which: np.ndarray) -> "_Cells":
-        return _Cells(self.problem, self.low, self.edges, self.numbers[which])
-
-    def cut(self, parts: np.ndarray) -> "_Cells":
-        """Return the cells cut into ``parts`` [3] along each axis."""
-        inner = np.stack(np.meshgrid(*map(np.arange, parts), indexing="ij"), -1).reshape(-1, 3)
-        return _Cells(self.problem, self.low, self.edges / parts,
-                      (self.numbers[:, None] * parts + inner).reshape(-1, 3))
-
-    def middles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the middles in the chart's coordinates and in space [m], [n, 3] each."""
-        flat = self.low + (self.numbers + 0.5) * self.edges
-        return flat, self.chart.curved(flat)
-
-    def nodes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the positions [m, 3] of all corners and of those next to them along an axis, and
-        the numbers of each cell's in ``_STENCIL``, [n, 32]."""
-        keys, where = np.unique(_keys(self.numbers[:, None] + _STENCIL), return_inverse=True)
-        indices = np.stack([keys // _WIDE**2, keys // _WIDE % _WIDE, keys % _WIDE], axis=1) - 1
-        return (self.chart.curved(self.low + indices * self.edges),
-                where.reshape(len(self.numbers), -1))
-
-    def holding(self, point: np.ndarray) -> np.ndarray:
-        """Return which cells contain ``point`` [3] or touch the cell that does, bool [n]."""
-        number = np.floor((self.chart.map(point)[0] - self.low) / self.edges)
-        return (np.abs(self.numbers - number) <= 1).all(axis=1)
-
-    def connected(self, some: np.ndarray) -> np.ndarray:
-        """Return which cells are connected to any of ``some``, bool [n]."""
-        together = connected_components(self._neighbours(), directed=False)[1]
-        return np.isin(together, together[some])
-
-    def path(self, begin: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
-        """Return the cells [k] of the shortest path from ``begin`` to ``ends``; None if not
-        connected."""
-        if not begin.any() or not ends.any():
-            return None
-        away, before, _ = dijkstra(self._neighbours(), directed=False, min_only=True,
-                                   indices=np.flatnonzero(begin), return_predecessors=True)
-        last = np.flatnonzero(ends)[np.argmin(away[ends])]
-        if not np.isfinite(away[last]):
-            return None
-        numbers = [last]
-        while before[numbers[-1]] >= 0:
-            numbers.append(before[numbers[-1]])
-        return np.array(numbers[::-1])
-
-    def _neighbours(self) -> coo_matrix:
-        """Return the distances [m] in the chart of cells that touch, [n, n], each once."""
-        keys = _keys(self.numbers)
-        order = np.argsort(keys)
-        rows, columns, lengths = [], [], []
-        for step in _AHEAD:
-            shifted = _keys(self.numbers + step)
-            found = order[np.searchsorted(keys, shifted, sorter=order).clip(max=len(keys) - 1)]
-            beside = np.flatnonzero(keys[found] == shifted)
-            rows.append(beside)
-            columns.append(found[beside])
-            lengths.append(np.full(len(beside), np.linalg.norm(step * self.edges)))
-        pairs = np.concatenate(rows), np.concatenate(columns)
-        return coo_matrix((np.concatenate(lengths), pairs), shape=2 * (len(keys),)).tocsr()
-
-    @property
-    def chart(self) -> Chart:
-        """The plain chart of the field's region."""
-        return self.problem.energy_field.region.chart.plain
 
 
 @dataclass(frozen=True)
@@ -157,11 +59,11 @@ def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
 def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> Verdict:
     """Cut cells until they prove that no path keeps the sure limits and comes within the field's
     error of the goal (0 if ``is_exact``), or contain a path, or are too many."""
-    cells, wall = _first(problem), _Wall(problem)
+    cells, wall = Cells.over(problem.energy_field), _Wall(problem)
     while True:
-        cells = cells.take(~_surely_outside(cells))
+        cells = cells.take(~_surely_outside(problem, cells))
         positions, nodes = cells.nodes()
-        over, uncertainty = _surely_over(cells, positions, nodes)
+        over, uncertainty = _surely_over(problem, cells, positions, nodes)
         begin = cells.holding(problem.start)
         away = problem.goal.distance(problem.energy_field, positions)[nodes]
         least, bends = _least(away)
@@ -179,13 +81,13 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
             reached = cells.take(connected)
             return Verdict(cells.edges, proven=True, wall=wall.about(reached), nearest=_nearest(
                 reached, short[open_cells][connected]) if off.any() else _NOWHERE)
-        free = kept[open_cells][:, _AT].all(axis=1)
-        reached = free & (away[open_cells][:, _AT] <= tolerance).any(axis=1)
+        free = kept[open_cells][:, AT].all(axis=1)
+        reached = free & (away[open_cells][:, AT] <= tolerance).any(axis=1)
         inner = cells.take(free)
         path = inner.path(begin[free], reached[free])
         if path is not None:
             last = open_cells[free][path[-1]]
-            end = nodes[last, _AT[np.argmin(away[last, _AT])]]
+            end = nodes[last, AT[np.argmin(away[last, AT])]]
             chart = inner.chart
             flat = np.concatenate([chart.map(problem.start), inner.middles()[0][path],
                                    chart.map(positions[end])])
@@ -199,7 +101,7 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
         cells = cells.take(connected).cut(parts)
 
 
-def _nearest(cells: _Cells, short: np.ndarray) -> np.ndarray:
+def _nearest(cells: Cells, short: np.ndarray) -> np.ndarray:
     """Return the middles [k, 3] of the cells that are least ``short`` of the goal [n], in order."""
     return cells.middles()[1][np.argsort(short, kind="stable")[:_MOST_NEAREST]]
 
@@ -209,12 +111,12 @@ class _Wall:
 
     def __init__(self, problem: GentleProblem):
         self.problem = problem
-        self.closed: list[_Cells] = []
+        self.closed: list[Cells] = []
 
-    def add(self, cells: _Cells) -> None:
+    def add(self, cells: Cells) -> None:
         self.closed.append(cells)
 
-    def about(self, reached: _Cells) -> np.ndarray:
+    def about(self, reached: Cells) -> np.ndarray:
         """Return the middles [k, 3] of those that touch any of the cells ``reached``."""
         if not len(reached.numbers):
             return np.empty((0, 3))
@@ -228,19 +130,9 @@ class _Wall:
         return least_over(self.problem, np.concatenate(found))
 
 
-def _first(problem: GentleProblem) -> _Cells:
-    region = problem.energy_field.region
-    chart = region.chart.plain
-    flat = chart.map(region.accepted)
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    counts = np.array([_ALONG, _ALONG, _ACROSS] if chart.radius > 0.0 else 3 * [_EVEN])
-    whole = _Cells(problem, low, np.maximum(high - low, 1e-9), np.zeros((1, 3), int))
-    return whole.cut(counts)
-
-
-def _surely_outside(cells: _Cells) -> np.ndarray:
+def _surely_outside(problem: GentleProblem, cells: Cells) -> np.ndarray:
     """Return which cells have no trusted point that is in the workspace, bool [n]."""
-    region, limits = cells.problem.energy_field.region, cells.problem.limits
+    region, limits = problem.energy_field.region, problem.limits
     middles, points = cells.middles()
     outside = region.plane_least(middles, 0.5 * cells.edges) > 0.0
     # Mapped back, a length grows by (R + w) / R at most.
@@ -256,27 +148,27 @@ def _surely_outside(cells: _Cells) -> np.ndarray:
     return outside
 
 
-def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
+def _surely_over(problem: GentleProblem, cells: Cells, positions: np.ndarray, nodes: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
     """Cells in which no point keeps the sure limits, bool [n], and this one's uncertainty by axis
     [n, 3]; ``nodes`` [n, 32] number each cell's ``positions`` [m, 3]."""
     over, uncertainty = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
-    for one in cells.problem.sure_quantities():
+    for one in problem.sure_quantities():
         values, slopes = one.smooth(positions)
         along = cells.chart.push_forward(positions, slopes) * cells.edges
         least, bends = _least(values[nodes], along[nodes])
-        spare = cells.problem.spare(one.name, positions)[nodes[:, _AT]].min(axis=1)
+        spare = problem.spare(one.name, positions)[nodes[:, AT]].min(axis=1)
         most = one.smooth_limit(spare)
         over |= least > most
         uncertainty = np.maximum(uncertainty, bends / most[:, None])
-    limit = cells.problem.sure_limits.max_force
+    limit = problem.sure_limits.max_force
     if limit < np.inf:
-        spare = cells.problem.spare("force", positions)[nodes[:, _AT]].min(axis=1)
-        force = cells.problem.energy_field.force(positions)[nodes]
+        spare = problem.spare("force", positions)[nodes[:, AT]].min(axis=1)
+        force = problem.energy_field.force(positions)[nodes]
         bends = _bends(force)
-        over |= off_zero(force[:, _AT]) - bends.sum(axis=1) > limit - spare
+        over |= off_zero(force[:, AT]) - bends.sum(axis=1) > limit - spare
         # Between corners it may be any value between theirs.
-        corners = force[:, _AT].reshape(-1, 2, 2, 2, 3)
+        corners = force[:, AT].reshape(-1, 2, 2, 2, 3)
         corners = np.stack([np.linalg.norm(np.diff(corners, axis=axis), axis=-1).max(axis=(1, 2, 3))
                             for axis in (1, 2, 3)], axis=1)
         uncertainty = np.maximum(uncertainty, (bends + corners) / limit)
@@ -284,12 +176,12 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
 
 
 def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The lower bound [n] in cells of a function with values [n, 32] at ``_STENCIL``, and slopes
+    """The lower bound [n] in cells of a function with values [n, 32] at their stencils, and slopes
     [n, 32, 3] along edges times their lengths; and what curvature takes off by axis [n, 3]."""
-    corners = values[:, _AT]
+    corners = values[:, AT]
     bends = _bends(values[..., None])
     if slopes is not None:
-        ends = slopes[:, _AT].reshape(-1, 2, 2, 2, 3)
+        ends = slopes[:, AT].reshape(-1, 2, 2, 2, 3)
         turns = np.stack([np.diff(ends[..., axis], axis=axis + 1).max(axis=(1, 2, 3))
                           for axis in range(3)], axis=1)
         bends = np.maximum(bends, 0.25 * turns)
@@ -297,14 +189,8 @@ def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.nda
 
 
 def _bends(values: np.ndarray) -> np.ndarray:
-    """The largest deviation of a function with values [n, 32, c] at ``_STENCIL`` from the corners'
+    """The largest deviation of a function with values [n, 32, c] at the stencils from the corners'
     trilinear interpolation, by its second differences along each axis [n, 3]."""
-    beside = values[:, _BESIDE]
-    second = beside[..., 0, :] - 2.0 * values[:, None, _AT] + beside[..., 1, :]
+    beside = values[:, BESIDE]
+    second = beside[..., 0, :] - 2.0 * values[:, None, AT] + beside[..., 1, :]
     return CURVATURE_FACTOR / 8.0 * np.linalg.norm(second, axis=-1).max(axis=2)
-
-
-def _keys(numbers: np.ndarray) -> np.ndarray:
-    """Return one number for each of ``numbers`` [..., 3], of which none is below -1."""
-    x, y, z = np.moveaxis(numbers + 1, -1, 0)
-    return (x * _WIDE + y) * _WIDE + z
