@@ -215,14 +215,14 @@ class TargetGoal:
         points = trusted if len(trusted) else points
         return points[np.argmin(self.distance(field, points))]
 
-    def target_position(self, states: States) -> np.ndarray:
-        """Return the target's position in the last state [m], shape [3]."""
-        return states.tips[-1] if self.target is None else states.targets[-1, self.target]
+    def target_positions(self, states: States) -> np.ndarray:
+        """Return the target's position in each state [m], shape [n, 3]."""
+        return states.tips if self.target is None else states.targets[:, self.target]
 
     def missed_by(self, states: States) -> float:
         """Return how far outside the region the target is in the last state [m]; inside: below 0.
         """
-        return float(self.region.distance(self.target_position(states)[None])[0])
+        return float(self.region.distance(self.target_positions(states))[-1])
 
     def drawn_in(self, states: States) -> Self:
         """Return the goal moved inwards by the last state's distance from it, at most half."""
@@ -238,7 +238,7 @@ class TargetGoal:
                 "region": self.region.describe()}
 
     def describe_end(self, states: States) -> dict:
-        return {"target_end_m": self.target_position(states)}
+        return {"target_end_m": self.target_positions(states)[-1]}
 
 
 def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:
@@ -412,14 +412,17 @@ class CellGoal(TargetGoal):
         return super().uncertainty(field, points)
 
     def drawn_in(self, states: States) -> Self:
-        positions = states.tips if self.target is None else states.targets[:, self.target]
-        found = super().drawn_in(states)._asked(states.poses[:, :3], positions,
-                                                states.displacements)
-        ends = bool(self._cause(positions[-1], states.displacements[-1]))
-        return replace(found, caution=found.caution * (_WARIER if ends else 1.0))
+        found = super().drawn_in(states)._met(states)
+        if not len(found.taken) or not self._cause(self.target_positions(states)[-1],
+                                                   states.displacements[-1]):
+            return found
+        # What the field takes for valid may not be: the branch model says what is.
+        chosen = found.taken[_far_apart(found.taken, _SOLVED)]
+        known = replace(found, taken=_NOWHERE)._solved(chosen)
+        return replace(known if len(known.taken) else found, caution=found.caution * _WARIER)
 
     def require_end(self, grasp_model: GraspModel, states: States) -> None:
-        self.cell_place.require(self.what, self.target_position(states),
+        self.cell_place.require(self.what, self.target_positions(states)[-1],
                                 self._surface(states.displacements[-1]))
 
     def learnt(self, field: EnergyField) -> Self:
@@ -461,25 +464,27 @@ class CellGoal(TargetGoal):
     def _of_states(self, field: EnergyField) -> Self:
         """Test states of the branch model at samples of the field in the region, far apart, and
         between them."""
-        samples = field.samples
-        positions = samples.tips if self.target is None or samples.targets is None else (
-            samples.targets[:, self.target])
-        inside = np.flatnonzero(self.region.distance(positions) <= 0.0)
+        inside = field.samples.positions[
+            self.region.distance(self.target_positions(field.samples)) <= 0.0]
         if not len(inside):
             return self
-        chosen = inside[_far_apart(samples.positions[inside], _SOLVED)]
-        found = solve_branch(self.grasp_model, samples.positions[chosen], workers=1)[0]
-        which = [chosen[one.target] for one in found]
-        asked = self._asked(samples.positions[which], positions[which],
-                            np.array([one.state.displacements[0] for one in found]))
 
         def causes_at(middle: np.ndarray) -> list[str]:
             causes = ["the branch has no equilibrium there"] * len(middle)
             for one in solve_branch(self.grasp_model, middle, workers=1)[0]:
-                causes[one.target] = self._cause(self.target_position(one.state),
+                causes[one.target] = self._cause(self.target_positions(one.state)[0],
                                                  one.state.displacements[0])
             return causes
-        return asked._sharpened(causes_at, _SOLVED_PAIRS, _SOLVED_HALVINGS)
+        return self._solved(inside[_far_apart(inside, _SOLVED)])._sharpened(
+            causes_at, _SOLVED_PAIRS, _SOLVED_HALVINGS)
+
+    def _solved(self, grasps: np.ndarray) -> Self:
+        """Return the goal with what the branch model comes to at ``grasps`` [n, 3]."""
+        found = [one.state for one in solve_branch(self.grasp_model, grasps, workers=1)[0]]
+        return self._met(States.joined(*found)) if found else self
+
+    def _met(self, states: States) -> Self:
+        return self._asked(states.positions, self.target_positions(states), states.displacements)
 
     def _asked(self, grasps: np.ndarray, positions: np.ndarray, moved: np.ndarray | None) -> Self:
         """Return the goal with poses [n, 3] added that have the target at ``positions`` [n, 3]; the
