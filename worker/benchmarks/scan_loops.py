@@ -66,8 +66,8 @@ class _Fit(FitSpec, EstimateYoung):
     """An estimate with what only Python sets."""
 
 
-SCAN_ROW = Asked("scan to moduli, branches of left-out sources, round and one-sided, noise 1 and 2 "
-                 "mm: 95 % intervals that hold",
+SCAN_ROW = Asked("scan to moduli, 0.3 MPa to 10 GPa, branches of left-out sources, round and "
+                 "one-sided, noise 1 and 2 mm: 95 % intervals that hold",
                  "88 to 99 %, or a refusal that says what the scan lacks")
 BENDING_ROW = Asked("the same of bending stiffness E I", "88 to 99 %")
 WIDTH_ROW = Asked("the same: median half width of E I's intervals, over the Cramer-Rao bound with "
