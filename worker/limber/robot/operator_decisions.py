@@ -103,10 +103,6 @@ def _retreated(link: RobotLink) -> dict[str, Any]:
         return link.retreat()
     except LimberError as error:
         return {"event": "refused", "reason": str(error)}
-    except KeyboardInterrupt:
-        # Ctrl-C stops the arm before anything else.
-        link.stop()
-        raise
 
 
 def _opened(cell: Cell, link: RobotLink, progress: Progress) -> tuple[bool, str]:

@@ -112,7 +112,7 @@ class RobotLink:
         or ``paused``, with its reason. SafetyStop if it was refused; WorkError if the driver has
         ended."""
         self.start(trajectory)
-        return self.wait("reached", "stopped", "paused", seconds=10 * trajectory.duration + 30.0)
+        return self._until_ended(10 * trajectory.duration + 30.0)
 
     def retreat(self, seconds: float = 600.0) -> dict[str, Any]:
         """Retreat along its path, slower, as a person asked; return ``reached``, or ``stopped``
@@ -122,7 +122,7 @@ class RobotLink:
         time.sleep(_STANDS_SECONDS)
         self._order(order="retreat")
         self.wait("started", seconds=5.0)
-        return self.wait("reached", "stopped", "paused", seconds=seconds)
+        return self._until_ended(seconds)
 
     def acknowledge(self) -> None:
         """A person has seen the stop."""
@@ -133,7 +133,15 @@ class RobotLink:
         """Continue after a pause, to the end of the trajectory."""
         self._order(order="resume")
         self.wait("resumed", seconds=5.0)
-        return self.wait("reached", "stopped", "paused", seconds=600.0)
+        return self._until_ended(600.0)
+
+    def _until_ended(self, seconds: float) -> dict[str, Any]:
+        try:
+            return self.wait("reached", "stopped", "paused", seconds=seconds)
+        except KeyboardInterrupt:
+            # Ctrl-C stops the arm before anything else.
+            self.stop()
+            raise
 
     def gripper(self, close: bool) -> None:
         """Close or open the gripper."""

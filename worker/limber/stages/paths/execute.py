@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
     from limber.robot.driver.link import LiveForce, RobotLink
     from limber.robot.motion.execution import Leg, RobotMotion
-    from limber.robot.motion.trajectory import Trajectory
     from limber.robot.recorder import PullPlausibility
     from limber.stages.pulls.record_nudge import Nudge
 
@@ -361,7 +360,7 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, asked: ExecutePlan,
             _stand(cell, link, leg, progress)
             continue
         begin = sum(map(len, batches))
-        event = _followed_to_its_end(link, leg.trajectory)
+        event = link.follow(leg.trajectory)
         if leg.name == "path":
             on_path = (begin, sum(map(len, batches)))
         if event["event"] != "reached":
@@ -393,12 +392,3 @@ def _open_at_start(cell: Cell, link: RobotLink, motion: RobotMotion) -> None:
     if is_driven(cell):
         link.gripper(close=False)
         time.sleep(cell.tool.grip_seconds)
-
-
-def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, Any]:
-    try:
-        return link.follow(trajectory)
-    except KeyboardInterrupt:
-        # Ctrl-C stops the arm before anything else.
-        link.stop()
-        raise

@@ -85,10 +85,6 @@ def nudged(link: RobotLink, live: LiveForce, across: Nudge, judging: list[PullPl
         event = link.follow(across.motion)
         # Its last samples may come after its end, and the branch comes to rest.
         time.sleep(_SETTLE_SECONDS)
-    except KeyboardInterrupt:
-        # Ctrl-C stops the arm before anything else.
-        link.stop()
-        raise
     finally:
         judging.remove(across.check)
     reason = across.check.reason

@@ -244,12 +244,7 @@ def _followed(move: Home | GotoStart | GotoGrasp | Release, cell: Cell, motions:
             grip(cell, link, close=False, progress=progress)
         link.tare(_TARE_SECONDS)
         for motion in motions:
-            try:
-                event = link.follow(motion)
-            except KeyboardInterrupt:
-                # Ctrl-C stops the arm before anything else.
-                link.stop()
-                raise
+            event = link.follow(motion)
             if event["event"] != "reached":
                 break
     result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason")}

@@ -95,12 +95,7 @@ def weighed(cell: Cell, link: RobotLink, moves: list[Trajectory], rows: list[np.
     link.tare(_TARE_SECONDS)
     read = [_reading(cell, rows)]
     for move in moves:
-        try:
-            event = link.follow(move)
-        except KeyboardInterrupt:
-            # Ctrl-C stops the arm before anything else.
-            link.stop()
-            raise
+        event = link.follow(move)
         if event["event"] != "reached":
             raise SafetyStop(f"The robot was stopped: {event['reason']}.", "It was tilting the "
                              "empty gripper, whose weight changes by 2 N at most.",
