@@ -1,7 +1,6 @@
 """The branch in the virtual gripper: its stiffness by differences, its force by statics."""
 
 import itertools
-import json
 import time
 import zlib
 from dataclasses import replace
@@ -341,15 +340,13 @@ def soon(robot, holds) -> dict:
 
 
 @pytest.mark.slow
-def test_the_real_client_feels_the_branch(setting, tmp_path, own_address):
+def test_the_real_client_feels_the_branch(setting, own_address):
     """Closed by a digital output, pulled by servoL, felt in the TCP force, opened again."""
     rtde_control = pytest.importorskip("rtde_control")
     import rtde_io
     import rtde_receive
 
-    path = tmp_path / "setting.json"
-    path.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}), encoding="utf-8")
-    with VirtualRobot("ur5e", own_address, ["--branch", path]) as robot:
+    with VirtualRobot("ur5e", own_address, setting) as robot:
         receive = rtde_receive.RTDEReceiveInterface(own_address)
         control = rtde_control.RTDEControlInterface(own_address)
         io = rtde_io.RTDEIOInterface(own_address)

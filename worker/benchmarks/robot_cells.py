@@ -1,6 +1,5 @@
 """A cell whose virtual robot has its gripper on a branch, and that robot."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -70,14 +69,8 @@ def robot_holding(branch: Branch, cell: Cell, folder: Path, *, seed: int = 0,
                   young: tuple[float, ...] = ()) -> VirtualRobot:
     """Return a virtual robot with the true branch of a folder in its gripper."""
     setting = true_branch(branch, cell, folder, young)
-    path = folder / "setting.json"
-    path.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}), encoding="utf-8")
-    options = ["--branch", path, "--seed", seed]
-    if cell.sensor.kind == "ft300":
-        options.append("--ft300")
-    if cell.tool.gripper == "robotiq":
-        options.append("--robotiq")
-    return VirtualRobot(cell.robot.model, cell.robot.address, options)
+    return VirtualRobot(cell.robot.model, cell.robot.address, setting, seed=seed,
+                        ft300=cell.sensor.kind == "ft300", robotiq=cell.tool.gripper == "robotiq")
 
 
 def cell_file(cell: Cell, folder: Path) -> Path:

@@ -238,5 +238,4 @@ def restored(robot: VirtualRobot) -> None:
 
 def new_robot(address: str, model: str, seed: int) -> VirtualRobot:
     """Return a virtual robot; a CB3 has an FT300."""
-    options = ["--seed", str(seed)] + ([] if arm_named(model).measures_force else ["--ft300"])
-    return VirtualRobot(model, address, options)
+    return VirtualRobot(model, address, seed=seed, ft300=not arm_named(model).measures_force)

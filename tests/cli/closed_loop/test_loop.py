@@ -190,7 +190,7 @@ def test_a_stop_tells_how_long_the_virtual_robot_was_held_up(tmp_path, monkeypat
     class Robot:
         process = SimpleNamespace(poll=lambda: None)
 
-        def __init__(self, *_arguments):
+        def __init__(self, *_arguments, **_settings):
             self.state = {"lost_seconds": 0.072}
 
         def __enter__(self):
@@ -206,9 +206,8 @@ def test_a_stop_tells_how_long_the_virtual_robot_was_held_up(tmp_path, monkeypat
     progress = Progress()
     monkeypatch.setattr(progress, "warn", warned.append)
     monkeypatch.setattr("limber.cli.closed_loop.loop.VirtualRobot", Robot)
-    mesh = SimpleNamespace(mesh=tmp_path / "truth.vtu")
-    for name, value in (("_grown", None), ("_cell", None), ("_setting", mesh)):
-        monkeypatch.setattr(ClosedLoop, name, lambda *_, value=value: value)
+    for name in ("_grown", "_cell", "_setting"):
+        monkeypatch.setattr(ClosedLoop, name, lambda *_: None)
     monkeypatch.setattr(ClosedLoop, "_reconstructed", stopped)
     with pytest.raises(SafetyStop, match="no data"):
         ClosedLoop(tmp_path / "loop", progress=progress).run()

@@ -5,7 +5,6 @@ the rest. All later steps use only what a user has: the camera's pictures, touch
 robot's ports and Limber's own commands. At the end both sides are compared.
 """
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -105,12 +104,8 @@ class ClosedLoop:
                              "Choose another folder with -o.")
         truth = self._grown()
         cell = self._cell(truth)
-        setting = self._setting(truth, cell)
-        file = self.folder / "truth.json"
-        file.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}),
-                        encoding="utf-8")
-        with VirtualRobot(self.model, self.address,
-                          ["--branch", str(file), "--seed", str(self.seed)]) as robot:
+        with VirtualRobot(self.model, self.address, self._setting(truth, cell), seed=self.seed,
+                          ) as robot:
             try:
                 moved = self._reconstructed(truth, cell)
                 planned = self._pulled_and_planned(robot)

@@ -17,6 +17,7 @@ import numpy as np
 from limber.core.errors import LimberError, WorkError
 from limber.core.processes.child import Child
 from limber.robot.driver.real_time import spare_what_is_loaded
+from limber.robot.virtual.branch_solver import BranchSetting
 from limber.robot.virtual.controller import Controller, Servo, nearest_joints
 from limber.robot.virtual.server import Server, new_loop
 
@@ -24,16 +25,16 @@ _START_SECONDS = 240.0  # the first start on a machine compiles the kernels of t
 
 
 class VirtualRobot:
-    """A virtual robot in its own process, on a loopback address; a context manager. ``options`` are
-    further ones of ``python -m limber.robot.virtual``."""
+    """A virtual robot in its own process, on a loopback address, with a ``branch`` for its gripper;
+    a context manager. ``settings`` are further ones of its :class:`.Controller`."""
 
     def __init__(self, model: str = "ur5e", address: str = "127.0.0.1",
-                 options: Sequence[str] = ()):
+                 branch: BranchSetting | None = None, **settings: Any):
         self.model, self.address = model, address
-        command = [sys.executable, "-m", "limber.robot.virtual", "--model", model,
-                   "--address", address, *map(str, options)]
-        self._child = Child(command)
+        self._child = Child([sys.executable, "-m", "limber.robot.virtual"])
         self.process = self._child.process
+        self._child.send({"model": model, "address": address, **settings,
+                          "branch": branch and {**vars(branch), "mesh": str(branch.mesh)}})
         try:
             started = self._answer(_START_SECONDS)
         except WorkError:
