@@ -16,8 +16,9 @@ class VirtualRobot(Tool):
     """Serve a UR controller on the ports that the real client library uses, loopback only.
 
     With a branch folder the gripper can hold that branch: its true modulus is --young, its mesh
-    differs from the folder's. Force mode, freedrive and contact detection are not supported: an
-    unknown command ends the program and is logged.
+    differs from the folder's. With --control it is led by hand, paused or stopped by lines such as
+    {"action": "local"} and {"action": "freedrive", "joints": [0, -1.5, 1.5, -1.6, -1.6, 0]}. Force
+    mode and contact detection are not supported: an unknown command ends the program and is logged.
     """
 
     about = About("virtual-robot", where="", found=(
@@ -35,6 +36,9 @@ class VirtualRobot(Tool):
     joints: tuple[float, float, float, float, float, float] | None = Field(
         None, description="Initial joint angles [rad].")
     seed: int = Field(0, description="Seed of the sensors' noise.")
+    control: bool = option(
+        "Take actions as JSON lines from standard input, and answer each with the robot's state. "
+        "Ends with the input.", False, switch=True)
     seconds: float | None = option("End after this time [s]. Default: run until Ctrl-C.")
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
@@ -62,7 +66,8 @@ class VirtualRobot(Tool):
                 ft300=cell.sensor.kind == "ft300" if cell else not arm_named(model).measures_force)
             controller.gripper_output = tool.close_output if tool else 0
             real_time = claim_real_time(VIRTUAL_ROBOT_PRIORITY)
-            server = serve(controller, address, seconds=self.seconds, say=progress.say)
+            server = serve(controller, address, control=self.control, seconds=self.seconds,
+                           say=progress.say)
         return {"model": controller.arm.name, "address": address, "steps": controller.step_count,
                 "real_time": real_time, "lost_seconds": server.lost_seconds}
 
