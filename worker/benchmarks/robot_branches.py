@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -25,7 +24,7 @@ from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_
 from benchmarks.table import Asked, Row, Setting, share_met
 from benchmarks.trials import column, joined, sound
 from limber.cell.cell_file import ApproachEntry
-from limber.cli.closed_loop.comparison import GOAL_TOLERANCE_M, comparison
+from limber.cli.closed_loop.comparison import GOAL_TOLERANCE_M, Watch, comparison
 from limber.cli.closed_loop.loop import OPEN_FACTOR, ClosedLoop
 from limber.cli.terminal import table_lines
 from limber.core.errors import LimberError
@@ -38,7 +37,6 @@ from limber.mechanics import solve_static
 from limber.mechanics.materials.materials import young_weights
 from limber.recordings.time_series import read_stream
 from limber.robot.motion.execution import across
-from limber.robot.virtual.launch import VirtualRobot
 from limber.stages.paths.execute import ExecutePlan
 from limber.stages.pulls.record import RecordPull
 from limber.stages.pulls.virtual_pull import load_truth
@@ -175,29 +173,16 @@ def _executed(seed: int, address: str) -> tuple[dict, float]:
         dry = executed().run()
         with robot_holding(branch, cell, folder, seed=seed, young=young) as robot:
             robot.ask("stand", joints=list(map(float, dry["start_joints_rad"])))
-            largest = [0.0]
-            ended = threading.Event()
-            watcher = threading.Thread(target=_watch, args=(robot, largest, ended))
-            watcher.start()
-            try:
+            with Watch(robot) as watch:
                 result = executed(arm=True, confirm="path", after_stop="hold").run()
-            finally:
-                ended.set()
-                watcher.join()
-        return result, largest[0]
-
-
-def _watch(robot: VirtualRobot, largest: list[float], ended: threading.Event) -> None:
-    """Record the virtual branch's error."""
-    while not ended.wait(0.2):
-        state = robot.state
-        largest[0] = max(largest[0], state.get("extrapolation_error_n", 0.0))
+        return result, watch.extrapolation_error
 
 
 # --- a recording for minutes, ended by kill -9 ---------------------------------------------------
 
 _DISTANCE_M = 0.012  # 20 times there and back with pauses take 630 s
 _BEGUN_M_S, _APART = 5e-4, 20  # samples over which a speed is taken
+_HEADER_BYTES = 1000  # more than the names of its columns
 _BEGIN_S = 120.0  # for connecting, the arc and the tare
 
 
@@ -224,7 +209,7 @@ def recorded_stream(setting: Setting, address: str) -> list[Row]:
         with robot_holding(branch, cell, Path(place), seed=seed, young=young) as robot:
             process = _started(branch, path)
             try:
-                begin, memory, grown, killed = _watched_stream(robot, process, seconds)
+                begin, memory, grown, killed = _watched_stream(branch, robot, process, seconds)
             finally:
                 # A separate driver process that ends with its pipe.
                 process.kill()
@@ -265,13 +250,18 @@ def _started(branch: Branch, path: Path) -> subprocess.Popen:
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def _watched_stream(robot, process: subprocess.Popen, seconds: float,
+def _watched_stream(branch: Branch, robot, process: subprocess.Popen, seconds: float,
              ) -> tuple[float, int, int, float | None]:
-    """Return the clock when it began to move, memory after a tenth of the time and its growth
-    since, and the clock of the kill; None if the recording ended before.
+    """Return the clock when it began to move with rows in the file, after the nudge, memory after a
+    tenth of the time and its growth since, and the clock of the kill; None if the recording ended
+    before.
     """
     end = time.monotonic() + _BEGIN_S
-    while np.linalg.norm(robot.state["tool_speed"][:3]) < _BEGUN_M_S:
+
+    def has_rows() -> bool:
+        folder = branch.growing("pulls/stream")
+        return folder is not None and (folder / "robot.csv").stat().st_size > _HEADER_BYTES
+    while not has_rows() or np.linalg.norm(robot.state["tool_speed"][:3]) < _BEGUN_M_S:
         if process.poll() is not None or time.monotonic() > end:
             raise RuntimeError("the recording did not begin")
         time.sleep(0.01)
