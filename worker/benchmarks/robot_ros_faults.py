@@ -1,4 +1,4 @@
-"""Faults of a robot in ROS while it moves, in stepped time: by goals, and by a servo stream."""
+"""Faults of a robot in ROS while it moves, in stepped time: by goals, and by two servo streams."""
 
 import json
 import re
@@ -84,6 +84,8 @@ FAULTS = {
     "clock jumps back": ("clock ran backwards", _set(clock_ahead=-1.0)),
     "stop of another node": ("[aA] stop was published", lambda robot, link: robot.server.obey(
         None, {"op": "publish", "topic": "/limber/stop", "msg": {"data": True}})),
+    "twist taken in base_link's axes": ("left its path|speed", _set(
+        axes=np.diag([-1.0, -1.0, 1.0]))),
     "push of 30 N": ("force", _set(wrench=np.array([0, 0, 30.0, 0, 0, 0])))}
 """Each with what the report must contain, as a regular expression; "": it is no fault, and the goal
 is reached."""
@@ -91,14 +93,16 @@ _FOR_THE_NODE = ("kill -9", "connection to rosbridge lost")  # Limber can give n
 
 _OF_GOALS = ("stop topic not passed on", "goal aborted", "goal cancelled by another", "goal missed",
              "goal called reached early", "rosbridge without actions", "slider at a fifth")
+_OF_TWISTS = ("twist taken in base_link's axes",)
 
 def with_names(**names: str) -> Cell:
     """The cell with names in ROS."""
     return ROS_CELL.model_copy(update={"robot": ROS_CELL.robot.model_copy(update={"ros": names})})
 
 
-CASES = [(name, output) for output in ("trajectory", "servo") for name in FAULTS
-         if output == "trajectory" or name not in _OF_GOALS]
+CASES = [(name, output) for output in ("trajectory", "servo", "twist") for name in FAULTS
+         if (output == "trajectory" or name not in _OF_GOALS)
+         and (output == "twist" or name not in _OF_TWISTS)]
 
 
 def provoked(name: str, output: str, onset: int = 50) -> dict[str, Any]:
@@ -106,9 +110,11 @@ def provoked(name: str, output: str, onset: int = 50) -> dict[str, Any]:
     the report; whether that names it and the arm stood after a short way, ``is_good``; and whether
     the arm ``moved`` after the release."""
     told, fault = FAULTS[name]
-    robot = SteppedRos((ServoBridge if output == "servo" else RosBridge)(HOME),
+    robot = SteppedRos((RosBridge if output == "trajectory" else ServoBridge)(HOME),
                        has_node=not told or name in _FOR_THE_NODE)
     server, well = robot.server, dict(robot.server.status)
+    # Where only the node can stop the arm, Servo itself goes on without a stream.
+    server.holds = 1e3 if name in _FOR_THE_NODE else 0.1
     with robot.here(), RobotLink(with_names(output=output)) as link:
         link.wait_for_samples()
         link.tare(0.25)
@@ -134,7 +140,7 @@ def provoked(name: str, output: str, onset: int = 50) -> dict[str, Any]:
 
 
 ROS_FAULT_ROWS = (
-    Asked(f"{len(FAULTS) - 1} faults of a robot in ROS, by goals and by a servo stream: stopped "
+    Asked(f"{len(FAULTS) - 1} faults of a robot in ROS, by goals and by two servo streams: stopped "
           "within 20 mm and named", "every one"),
     Asked("the same: motion after a fault's release", "0"))
 

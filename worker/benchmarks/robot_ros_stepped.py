@@ -44,20 +44,28 @@ def to_and_fro(out: Trajectory, rest: float, cycles: int = 1) -> Trajectory:
 
 
 class ServoBridge(RosBridge):
-    """MoveIt Servo's end: it moves the joints by the last speeds that came, for 0.1 s."""
+    """MoveIt Servo's end: it moves the joints by the last speeds that came, or by the twist of the
+    flange in the axes of a frame, for ``holds`` [s], and not at all once it ``is_paused``."""
 
-    until = 0
+    until, holds, is_paused = 0.0, 0.1, False
+    axes = np.eye(3)  # of the frame "base" against the controller's
 
     def _hear(self, socket, order):
         super()._hear(socket, order)
         if order["op"] == "publish" and order["topic"] == Topics().jog:
             speeds = dict(zip(order["msg"]["joint_names"], order["msg"]["velocities"], strict=True))
             self.drift = np.array([speeds[f"{name}_joint"] for name in ROS_CELL.arm.ros_joints])
-            self.until = 0.1 / STEP
+            self.until = self.holds / STEP
+        elif order["op"] == "publish" and order["topic"] == Topics().twist:
+            assert order["msg"]["header"]["frame_id"] == "base"
+            parts = (order["msg"]["twist"][kind] for kind in ("linear", "angular"))
+            self.drift = np.linalg.solve(ROS_CELL.arm.jacobian(self.joints), np.concatenate(
+                [self.axes @ [part[axis] for axis in "xyz"] for part in parts]))
+            self.until = self.holds / STEP
 
     def _step(self, socket):
         self.until -= 1
-        self.drift = self.drift * (self.until > 0 and not self.sticks)
+        self.drift = self.drift * (self.until > 0 and not (self.sticks or self.is_paused))
         super()._step(socket)
 
 
@@ -100,8 +108,10 @@ class SteppedRos(SteppedRobot):
                  for order in words if order["topic"].endswith("/stop")]
         if any(order["topic"].endswith("/end") for order in words):
             self._watch.ended()
-        if (any(stops) or self._watch.is_silent(self.now)) and self.server.is_busy:
-            self.end_goal(5)
+        if any(stops) or self._watch.is_silent(self.now):
+            self.server.is_paused = True
+            if self.server.is_busy:
+                self.end_goal(5)
 
     @contextlib.contextmanager
     def here(self):

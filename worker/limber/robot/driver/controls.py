@@ -27,7 +27,7 @@ def _ros(cell: Cell) -> ArmControl:
     """Open the robot behind a rosbridge."""
     from limber.robot.ros.ros_control import RosControl, RosServo
 
-    return (RosServo if Topics.of_cell(cell).output == "servo" else RosControl)(cell)
+    return (RosControl if Topics.of_cell(cell).output == "trajectory" else RosServo)(cell)
 
 
 _CONTROLS: dict[str, Callable[[Cell], ArmControl]] = {

@@ -21,6 +21,7 @@ END = "std_msgs/msg/Empty"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
 JOG = "control_msgs/msg/JointJog"
+TWIST = "geometry_msgs/msg/TwistStamped"
 STATUS_KINDS = {"safety_mode": "ur_dashboard_msgs/msg/SafetyMode",
                 "robot_mode": "ur_dashboard_msgs/msg/RobotMode",
                 "runtime_state": "std_msgs/msg/Bool", "slider": "std_msgs/msg/Float64"}

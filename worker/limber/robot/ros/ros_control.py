@@ -39,22 +39,19 @@ _PAYLOAD = "ur_msgs/srv/SetPayload"
 
 
 class RosSensor:
-    """The cell's force sensor as its topic reports it, in its own frame."""
+    """The cell's force sensor as its topic reports it, in its own frame; ``is_heard``: whether it
+    has sent anything yet."""
 
     connections: tuple[socket.socket, ...] = ()
 
     def __init__(self, cell: Cell):
         self._frame = frame_of(np.array(cell.sensor.pose))
-        self._last, self._arrived = np.full(6, np.nan), -np.inf
-
-    @property
-    def is_heard(self) -> bool:
-        """Whether it has sent anything yet."""
-        return bool(np.isfinite(self._arrived))
+        self._last, self._arrived, self.is_heard = np.full(6, np.nan), -np.inf, False
 
     def take(self, message: dict[str, Any]) -> None:
         """Take a stamped wrench."""
         self._last, self._arrived = messages.wrench_of(message), time.monotonic()
+        self.is_heard = True
 
     def read(self, sample: Sample) -> Reading:
         """Return the newest reading."""
@@ -363,17 +360,22 @@ class RosControl:
 
 
 class RosServo(RosControl):
-    """The same robot by a stream of joint speeds (JointJog) to MoveIt Servo, which halts the arm a
-    tenth of a second after the last of them."""
+    """The same robot by a stream to MoveIt Servo, which halts the arm a tenth of a second after its
+    last message: of joint speeds (JointJog), or of the flange's twist (TwistStamped). Servo applies
+    a twist at its group's tip link, a UR arm's tool0, and turns it from the axes of its frame: so
+    not the grasp's own speed is sent, but that of the flange that carries it."""
 
     silence, by_joints = 0.1, True
     # No whole trajectories: it is no TrajectoryControl.
     follow = progress = None  # type: ignore[assignment]
 
     def __init__(self, cell: Cell, bridge: Bridge | None = None):
-        super().__init__(cell, bridge)
         self._sent: tuple[np.ndarray, float] | None = None
-        self._bridge.advertise(self._topics.jog, messages.JOG)
+        super().__init__(cell, bridge)
+        topics = self._topics
+        self._stream, kind, self._frame = (topics.jog, messages.JOG, "") if (
+            topics.output == "servo") else (topics.twist, messages.TWIST, topics.twist_frame)
+        self._bridge.advertise(self._stream, kind)
 
     def servo_joints(self, joints: np.ndarray) -> bool:
         """Send the speeds that bring the joints to their next angles [rad], shape [n], and back
@@ -387,10 +389,22 @@ class RosServo(RosControl):
 
     def _jog(self, speeds: np.ndarray) -> None:
         seconds, nanoseconds = divmod(round(1e9 * self._recent[-1].clock), 10**9)
-        self._bridge.send(op="publish", topic=self._topics.jog, msg={
-            "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": ""},
-            "joint_names": self._states.ordered, "displacements": [], "duration": 0.0,
-            "velocities": np.round(speeds, 6).tolist()})
+        if self._frame:
+            twist = self._cell.arm.jacobian(self._recent[-1].joints) @ speeds
+            linear, angular = (dict(zip("xyz", part, strict=True))
+                               for part in twist.reshape(2, 3).tolist())
+            message: dict[str, Any] = {"twist": {"linear": linear, "angular": angular}}
+        else:
+            message = {"joint_names": self._states.ordered, "displacements": [], "duration": 0.0,
+                       "velocities": np.round(speeds, 6).tolist()}
+        self._bridge.send(op="publish", topic=self._stream, msg=message | {"header": {
+            "stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": self._frame}})
+
+    def _send_due(self) -> None:
+        """Beat while the stream goes on, for the node beside the controller."""
+        if self._sent is not None and time.monotonic() - self._beat > BEAT_SECONDS:
+            self._beat = time.monotonic()
+            self._say(False)
 
     def _take_stop(self, message: dict[str, Any]) -> None:
         if message.get("data") and self._sent is not None:
@@ -400,6 +414,7 @@ class RosServo(RosControl):
         """Stop the joints."""
         self._sent = None
         self._jog(np.zeros(len(self._states.ordered)))
+        self._bridge.send(op="publish", topic=self._topics.end, msg={})
         return True
 
 

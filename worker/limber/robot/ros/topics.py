@@ -12,15 +12,18 @@ WRENCH = "geometry_msgs/msg/WrenchStamped"
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the robot's topics and actions, by default the UR driver's; ``output`` is trajectory
-    or servo, which streams to ``jog``; ``safety_mode`` to ``slider`` are what a UR arm's driver
-    publishes of its controller, ``prefix`` that of its joints' names."""
+    """Names of the robot's topics and actions, by default the UR driver's; ``output`` is
+    trajectory, servo, which streams to ``jog``, or twist, which streams to ``twist`` in the axes
+    of ``twist_frame``, the controller's base in TF; ``safety_mode`` to ``slider`` are what a UR
+    arm's driver publishes of its controller, ``prefix`` that of its joints' names."""
 
     prefix: str = ""
     joint_states: str = "/joint_states"
     wrench: str = "/force_torque_sensor_broadcaster/wrench"
     output: str = "trajectory"
     jog: str = "/servo_node/delta_joint_cmds"
+    twist: str = "/servo_node/delta_twist_cmds"
+    twist_frame: str = "base"
     stop: str = "/limber/stop"
     end: str = "/limber/end"
     trajectory: str = "/scaled_joint_trajectory_controller/follow_joint_trajectory"
@@ -43,9 +46,9 @@ class Topics:
         if unknown := [name for name in stated if name not in known]:
             raise InputError(f"[robot.ros] states {', '.join(unknown)}.", "",
                              f"Known are namespace, {', '.join(known)}.")
-        if stated.get("output", "servo") not in ("trajectory", "servo"):
+        if stated.get("output", "servo") not in ("trajectory", "servo", "twist"):
             raise InputError(f"robot.ros.output is {stated['output']}.", "",
-                             "It is trajectory or servo.")
+                             "It is trajectory, servo or twist.")
         return cls(**{name: f"/{space}{usual}" if space and usual.startswith("/") else usual
                       for name, usual in known.items()} | stated)
 
@@ -67,10 +70,7 @@ def is_ros(cell: Cell) -> bool:
     return cell.robot.address.startswith(("ws://", "wss://"))
 
 
-_USUAL = Topics()
-
-
-def wrench_topic(cell: Cell, own: str = _USUAL.wrench) -> str:
+def wrench_topic(cell: Cell, own: str = Topics.wrench) -> str:
     """Return the topic of the cell's force sensor, ``own`` for the arm's; InputError if the cell
     names none that is heard in ROS, or a CB3's own estimate."""
     require_sensor(cell)
