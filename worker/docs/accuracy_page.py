@@ -6,10 +6,12 @@ and count. Nothing is written here by hand but what each bench measures against.
 
 import datetime
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 DATA = Path(__file__).parent / "data"
+URSIM = DATA / "ursim.json"
 
 CHAPTERS = {
     "scans": ("Skeletons, radii and volume", (
@@ -80,11 +82,33 @@ def accuracy_page() -> str:
     for bench, (title, about) in CHAPTERS.items():
         if (DATA / f"{bench}.json").is_file():
             parts.extend(_chapter(bench, title, about))
+        if bench == "robot":
+            parts.append(_ursim())
     parts += ["## What was not measured\n", (
         "Wood in the field: no modulus of a real plant was compared with a test in a laboratory. "
         "A real robot: nothing but the controller in software was moved. Leaves in the wind: the "
         "drag is that of bare wood.\n")]
     return "\n".join(parts)
+
+
+def log_ursim(address: str, model: str, passed: bool) -> None:
+    """Log a run of the tests against the maker's simulator there, for the page."""
+    from limber.robot.ur.rtde import Dashboard
+
+    runs = json.loads(URSIM.read_text(encoding="utf-8"))
+    with closing(Dashboard(address)) as dashboard:
+        runs.append({"date": datetime.date.today().isoformat(), "model": model,
+                     "version": dashboard.ask("PolyscopeVersion"), "passed": passed})
+    URSIM.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
+
+
+def _ursim() -> str:
+    """Return when the maker's simulator was last asked, and what came of it."""
+    runs = json.loads(URSIM.read_text(encoding="utf-8"))
+    told = "; ".join(f"{run['date']}: {run['model']}, {run['version']}, "
+                     f"{'passed' if run['passed'] else '**failed**'}" for run in runs)
+    return (f"Universal Robots' own simulator (`LIMBER_URSIM=ADDRESS scripts/test "
+            f"tests/robot/test_ursim.py`): {told or 'never run'}.\n")
 
 
 def _chapter(bench: str, title: str, about: str) -> list[str]:
