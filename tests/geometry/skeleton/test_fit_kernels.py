@@ -3,11 +3,12 @@
 import numpy as np
 
 from limber.geometry.skeleton.radii.fit_kernels import (
+    match_cylinders,
     mean_on_circle,
-    nearest_of,
     normal_blocks,
     reach_on_circle,
 )
+from limber.geometry.skeleton.skeleton import Skeleton
 
 
 def test_nearest_cylinder_is_the_one_that_a_search_along_all_finds() -> None:
@@ -15,21 +16,21 @@ def test_nearest_cylinder_is_the_one_that_a_search_along_all_finds() -> None:
     rng = np.random.default_rng(3)
     nodes = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 2], [0.8, 0, 1.5]])
     parent, radius = np.array([-1, 0, 1, 1]), np.array([0.2, 0.15, 0.1, 0.05])
-    own = np.array([False, False, False, True])
     points = rng.uniform([-1, -1, -0.5], [1.5, 1, 2.5], (200, 3))
     near = np.tile([1, 2, 3], (len(points), 1))
-    segment, share, normal, residual, thick = nearest_of(points, near, parent, own, nodes, radius)
+    m = match_cylinders(Skeleton.from_edges(nodes, parent, radius), points, near)
     t = np.linspace(0, 1, 2001)[:, None]
     least = np.full(len(points), np.inf)
     for end in (1, 2, 3):
         axis = (1 - t) * nodes[parent[end]] + t * nodes[end]
-        here = np.full(len(t), radius[end]) if own[end] else (
+        here = np.full(len(t), radius[end]) if end == 3 else (
             (1 - t) * radius[parent[end]] + t * radius[end])[:, 0]
         foot = np.linalg.norm(points[:, None] - axis, axis=2).argmin(axis=1)
         least = np.minimum(least, np.linalg.norm(points - axis[foot], axis=1) - here[foot])
-    np.testing.assert_allclose(residual, least, atol=1e-3)
-    foot = (1 - share)[:, None] * nodes[parent[segment]] + share[:, None] * nodes[segment]
-    np.testing.assert_allclose(foot + (residual + thick)[:, None] * normal, points, atol=1e-12)
+    np.testing.assert_allclose(m.residual, least, atol=1e-3)
+    foot = (1 - m.share)[:, None] * nodes[parent[m.segment]] + m.share[:, None] * nodes[m.segment]
+    found = foot + (m.residual + m.thick)[:, None] * m.normal
+    np.testing.assert_allclose(found, points, atol=1e-12)
 
 
 def test_blocks_are_the_sums_of_outer_products() -> None:

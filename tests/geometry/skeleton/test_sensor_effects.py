@@ -57,7 +57,7 @@ def test_nodes_that_come_near_each_other_do_not_throw_a_round_off(apart: float) 
     start, points = _axis(0.006), _points(0.006, 0.0008, half=False)
     nodes = start.nodes.copy()
     nodes[21, 2] = nodes[20, 2] + apart
-    match = match_cylinders(start.parent, start.order, nodes, start.radius, points)
+    match = match_cylinders(start.moved(nodes), points)
     step = normal_equations(start, nodes, start.radius, match, np.ones(len(points)), 8e-4).solve()
     assert np.linalg.norm(step[:, :3], axis=1).max() < 0.006
     assert np.abs(step[:, 3]).max() < 0.001

@@ -5,13 +5,6 @@ namespace {
 constexpr double kPi = 3.141592653589793;
 constexpr double kNowhere = 12.0;  // standard deviations from a skin beyond which it shows no point
 
-double power_of(double x, int exponent) {
-  double result = 1.0;
-  for (; exponent; exponent >>= 1, x *= x)
-    if (exponent & 1) result *= x;
-  return result;
-}
-
 // exp(-x) I0(x), to 2e-7 of it (Abramowitz and Stegun 1964, 9.8.1 and 9.8.2).
 double bessel(double x) {
   if (x < 3.75) {
@@ -25,30 +18,34 @@ double bessel(double x) {
 }
 
 // Density [1/m^2] across an axis times a power of its radius [m]; facing is NaN where points are seen
-// from all around. `hidden`: density of the half hidden from a sensor, as a fraction of that all around.
-double density(double distance, double radius, double facing, double noise, double power, double hidden) {
+// from all around. `hidden`: density of the half hidden from a sensor, as a fraction of that all around;
+// `open`: sine of the angle between axis and sight; `sharp`: noise across the sight over that along it.
+double density(double distance, double radius, double facing, double open, double noise, double power, double hidden,
+               double sharp) {
   const double off = (distance - radius) / noise;
   if (fabs(off) > kNowhere) return 0.0;
-  const double sharpness = distance * radius / (noise * noise);
-  const double all_around = pow(radius, power) * bessel(sharpness) * exp(-0.5 * (off * off)) / (2 * kPi * (noise * noise));
+  const double sharpness = distance * radius / (noise * noise), size = pow(radius, power);
+  const double all_around = size * bessel(sharpness) * exp(-0.5 * (off * off)) / (2 * kPi * (noise * noise));
   if (isnan(facing)) return all_around;
-  // Fourier's series of the half-wave rectified cosine. Around the circle the noise is von Mises';
-  // its harmonics are nearly those of a wrapped normal distribution.
-  const double first = sharpness / (0.5 + sqrt(sharpness * sharpness + 2.25)), twice = 2 * (facing * facing) - 1;
-  const double seen = 1 + kPi / 2 * first * facing + 2.0 / 3 * power_of(first, 4) * twice
-      - 2.0 / 15 * power_of(first, 16) * (2 * (twice * twice) - 1)
-      + 2.0 / 35 * power_of(first, 36) * (4 * power_of(twice, 3) - 3 * twice);
-  return all_around * (hidden + (1 - hidden) * greater(seen, 0.0));
+  // Rays are even from edge to edge, and meet a circle's front there.
+  const double across = sharp * noise, along = noise * sqrt(open * open + (1 - open * open) * (sharp * sharp));
+  const double aside = distance * sqrt(greater(1 - facing * facing, 0.0)), unit = sqrt(2.0) * across;
+  const double even = (erfc((aside - radius) / unit) - erfc((aside + radius) / unit)) / (4 * radius);
+  const double known = radius * radius / (radius * radius + 3 * (across * across)), place = lesser(aside / radius, 1.0);
+  const double front = radius * sqrt(1 - (known * (place * place) + (1 - known) / 3));
+  const double deep = (distance * facing - front) / along;
+  return hidden * all_around + (1 - hidden) * size * even * exp(-0.5 * (deep * deep)) / (sqrt(2 * kPi) * along);
 }
 }  // namespace
 
 // Density [m, k] times a power of the radius at distances [m] from axes [m] with radii [m] for each noise [k]
-// [m]; facing [m] is the cosine of the angle to the sensor, or NaN.
-KERNEL void densities(const double* distance, const double* radius, const double* facing, const double* noises, double* found,
-                      double power, double hidden, int64_t count, int64_t noise_count) {
+// [m]; facing [m] is the cosine of the angle to the sensor, or NaN, and open [m] as above.
+KERNEL void densities(const double* distance, const double* radius, const double* facing, const double* open,
+                      const double* noises, double* found, double power, double hidden, double sharp, int64_t count,
+                      int64_t noise_count) {
   for (int64_t i = 0; i < count; ++i)
     for (int64_t k = 0; k < noise_count; ++k)
-      found[noise_count * i + k] = density(distance[i], radius[i], facing[i], noises[k], power, hidden);
+      found[noise_count * i + k] = density(distance[i], radius[i], facing[i], open[i], noises[k], power, hidden, sharp);
 }
 
 // The first nodes of each point's [m, k], nearest first, that are not gone [n], into [m, count]; the last one
@@ -64,6 +61,48 @@ KERNEL void nodes_left(const int64_t* near, const uint8_t* gone, int64_t* found,
         ++place;
       }
   }
+}
+
+// The nearest values [n] that nowhere rise away from the root, by least squares with weights [n], on a tree by
+// its parents [n], each before its children: blocks of one value, of which a node takes the blocks below
+// it, the largest first, as long as one is over its own.
+KERNEL void falling(const double* value, const double* weight, const int64_t* parent, double* found, int64_t nodes) {
+  Scratch<double> total(nodes), mass(nodes);
+  Scratch<int64_t> block(nodes), first(nodes), last(nodes), next(nodes);  // lists of the blocks below each
+  for (int64_t i = 0; i < nodes; ++i) {
+    total[i] = weight[i] * value[i];
+    mass[i] = weight[i];
+    block[i] = i;
+    first[i] = last[i] = next[i] = -1;
+  }
+  auto append = [&](int64_t to, int64_t from, int64_t end) {
+    if (from < 0) return;
+    if (first[to] < 0) first[to] = from;
+    else next[last[to]] = from;
+    last[to] = end;
+  };
+  for (int64_t i = nodes - 1; i >= 0; --i) {
+    for (;;) {
+      int64_t most = -1, before_most = -1;
+      for (int64_t k = first[i], before = -1; k >= 0; before = k, k = next[k])
+        if (most < 0 || total[k] / mass[k] > total[most] / mass[most]) {
+          most = k;
+          before_most = before;
+        }
+      if (most < 0 || total[most] / mass[most] <= total[i] / mass[i]) break;
+      total[i] += total[most];
+      mass[i] += mass[most];
+      block[most] = i;
+      if (before_most < 0) first[i] = next[most];
+      else next[before_most] = next[most];
+      if (last[i] == most) last[i] = before_most;
+      append(i, first[most], last[most]);
+    }
+    next[i] = -1;
+    if (i) append(parent[i], i, i);
+  }
+  for (int64_t i = 1; i < nodes; ++i) block[i] = block[block[i]];
+  for (int64_t i = 0; i < nodes; ++i) found[i] = total[block[i]] / mass[block[i]];
 }
 
 // By how much each of t cylinders, foot and end [t, 3] and radius [t], raises the logarithm of the

@@ -156,8 +156,7 @@ def _unexplained_by_carriers(skeleton: Skeleton, points: np.ndarray, segment: np
             continue
         middle = (skeleton.nodes[carrier] + skeleton.nodes[skeleton.parent[carrier]]) / 2
         near = cKDTree(middle).query(points[own], k=min(_BESIDE, len(carrier)))[1]
-        match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                                points[own], carrier[near.reshape(len(own), -1)])
+        match = match_cylinders(skeleton, points[own], carrier[near.reshape(len(own), -1)])
         off = match.residual > _STRAY * np.hypot(noise, _ROUGH * match.thick)
         count[number] = np.minimum(np.unique(segment[own[off]], return_counts=True)[1],
                                    _TOGETHER).sum()

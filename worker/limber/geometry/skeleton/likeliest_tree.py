@@ -8,6 +8,7 @@ posterior with the prior of wood: an expectation step asks where on the skin eac
 the noise, and a maximisation step moves axes and radii to fit (Dempster, Laird, Rubin 1977).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 
@@ -20,9 +21,9 @@ from scipy.special import i0e, i1e
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed, doubted
-from limber.geometry.skeleton.likelihood_kernels import HIDDEN, densities, left
-from limber.geometry.skeleton.radii.axis_fit import TargetDistances, data_terms
-from limber.geometry.skeleton.radii.fit_kernels import cylinders_around, nearest_cylinders
+from limber.geometry.skeleton.likelihood_kernels import densities, falling, left
+from limber.geometry.skeleton.radii.axis_fit import held_by_points
+from limber.geometry.skeleton.radii.fit_kernels import Match, cylinders_around, nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import by_projected_widths
 from limber.geometry.skeleton.radii.wood import Bends, Wood, turn_cost, turn_variance
 from limber.geometry.skeleton.repair import PointSpacing, resampled, without_kinks
@@ -47,9 +48,9 @@ _APART = 0.08
 # nor is their noise the same everywhere, so what a twig must explain is not known well.
 _DEARER = 4.0
 _BESIDE, _KNOWN = 6, 32  # cylinders a point may be of, of so many around it
-_TABLE, _FACINGS = 48, 5  # distances and angles at which the density of a new twig is known
-_POSITIONS = (2 * np.arange(24) + 1) / 24 - 1  # around an axis, within so many deviations:
-_WIDE = 4.5
+_SHARP = (0.5, 0.25, 0.12, 0.06)  # noise across a sensor's sight over that along it, in turn
+_STEEP = 0.3  # least height of a front in radii by which that goes with the radius
+_TABLE, _FACINGS = 48, 9  # distances and angles at which the density of a new twig is known
 
 
 def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View | None = None,
@@ -61,16 +62,19 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
     # A beam wider than twigs shows them like thick axes; a thin one shows skins by their area.
     scan = max((replace(PointLikelihood.of(points), power=power) for power in (0.0, 0.5, 1.0)),
                key=lambda one: one.score(known))
-    around = [likeliest_tree(start, scan, apart, progress.part(part, part + 0.35))
-              for part, start in ((0.0, first), (0.35, known))]
-    skeleton, count, score = max(around, key=itemgetter(2))
+    skeleton, count, score, _ = likeliest_tree([(first, scan), (known, scan)], apart,
+                                               progress.part(0.0, 0.5))
     # Whether one sensor saw them is asked of whole searches: twigs that hang to one side of a
     # thick axis look so too, and a thin axis beside a branch's middle hides it.
-    seen = scan.where_seen(skeleton)
-    if seen.sight is not None:
-        other, more, sighted = likeliest_tree(skeleton, seen, apart, progress.part(0.7, 1.0))
-        if sighted > score:
-            scan, skeleton, count = seen, other, count + more
+    wide, seen, starts = skeleton, scan.where_seen(skeleton), []
+    for sharp in _SHARP:  # at once, thin axes would stay where their points are
+        seen = replace(seen.turned(wide), sharp=sharp)
+        wide = fitted(_spaced(wide, apart), seen, _STEPS)
+        starts.append((wide, seen))
+    starts.sort(key=lambda one: one[1].score(one[0]))
+    other, more, sighted, seen = likeliest_tree(starts[-1:], apart, progress.part(0.5, 1.0))
+    if sighted > score + scan.twig_cost:  # it has numbers too
+        scan, skeleton, other, count = seen, other, skeleton, count + more
     skeleton = fitted(_spaced(skeleton, apart), scan, _LAST_STEPS)
     spaced, cost = _spaced(skeleton, apart), scan.twig_numbers
     few, many = (State.of(spaced, replace(scan, twig_numbers=each)) for each in (
@@ -84,25 +88,31 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
     found = assessed(skeleton.on_grid(), points, noise, rays=rays, view=view if rays else None)
     even, kinks = without_kinks(found)
     return doubted(even, points, noise) if kinks else found, noise, count, float(np.linalg.norm(
-        [_APART, unknown / 2, np.std([np.log(one.length) for one, *_ in around])]))
+        [_APART, unknown / 2, np.log(other.length / skeleton.length) / 2]))
 
 
-def likeliest_tree(first: Skeleton, scan: PointLikelihood, apart: PointSpacing,
-                   progress: Progress = SILENT) -> tuple[Skeleton, int, float]:
-    """The likeliest tree found from the ``first``, the number of twigs left out, and the score."""
-    skeleton, best, found, count = first, -np.inf, first, 0
+def likeliest_tree(starts: Sequence[tuple[Skeleton, PointLikelihood]], apart: PointSpacing,
+                   progress: Progress = SILENT) -> tuple[Skeleton, int, float, PointLikelihood]:
+    """The likeliest tree found from that of the ``starts`` which scores most after a first pass,
+    the number of twigs left out, the score, and the scan as its sensor then sees it."""
+    count, found = 0, (-np.inf, *starts[0])
     for number in range(_PASSES):
         progress(number / _PASSES, "comparing trees")
-        state = State.of(fitted(_spaced(skeleton, apart), scan, _STEPS), scan)
-        rest = drawn_back(pruned(state))
-        count += state.skeleton.branch_count - rest.skeleton.branch_count
-        if (score := scan.score(rest.skeleton)) > best:
-            best, found = score, rest.skeleton
+        tried = []
+        for skeleton, scan in starts:
+            skeleton = fitted(_spaced(skeleton, apart), scan, _STEPS)
+            rest = drawn_back(pruned(State.of(skeleton, scan.turned(skeleton))))
+            tried.append((rest.scan.score(rest.skeleton), rest,
+                          skeleton.branch_count - rest.skeleton.branch_count))
+        score, rest, fewer = max(tried, key=itemgetter(0))
+        count += fewer
+        if score > found[0]:
+            found = score, rest.skeleton, rest.scan
         after = grown(rest, apart)
-        skeleton = after.skeleton
         if after is rest:
             break
-    return found, count, best
+        starts = [(after.skeleton, after.scan)]
+    return found[1], count, found[0], found[2]
 
 
 def _spaced(skeleton: Skeleton, apart: PointSpacing) -> Skeleton:
@@ -123,20 +133,16 @@ def fitted(skeleton: Skeleton, scan: PointLikelihood, steps: int) -> Skeleton:
 
 def _step(skeleton: Skeleton, scan: PointLikelihood, prior: "_Prior") -> Skeleton:
     match = scan.match(skeleton)
-    distance = np.maximum(match.residual + match.thick, 1e-12)
     density = scan.densities(skeleton, match)
     scatter = scan.scattered(skeleton, density)
     share = density * scatter.shares / scan.skin(skeleton).sum()
     share /= (share.sum(axis=1) + scatter.background / scan.volume)[:, None]
     weight = (share / scan.noises**2).sum(axis=1)
-    axes = scan.axes(skeleton, match)
-    across = np.cross(axes, match.normal)
-    place = _places(axes, match.normal, distance * match.thick * weight, scan, across)
-    outwards = np.einsum("mj,mj->m", place, match.normal)
-    firm = np.maximum(1 - match.thick * outwards / distance, _FIRM)
-    own, right, _ = data_terms(skeleton.parent, skeleton.nodes, match, weight, place,
-                               TargetDistances(match.thick, match.thick),
-                               np.sqrt(firm)[:, None] * across)
+    axes, count = scan.axes(skeleton, match), share.sum(axis=1)
+    # Of points that no axis explains it is the common one.
+    variance = (count + 1e-12) / (weight + 1e-12 / scatter.scale**2)
+    own, right = _all_around(skeleton, match, axes, weight) if scan.sight is None else _by_rays(
+        skeleton, match, axes, count, variance, scan)
     # In logarithms of radii.
     unit = np.column_stack([np.ones_like(skeleton.nodes), skeleton.radius]).ravel()
     own = own.multiply(unit).T.multiply(unit)
@@ -146,30 +152,7 @@ def _step(skeleton: Skeleton, scan: PointLikelihood, prior: "_Prior") -> Skeleto
     move = step[:, :3] / np.maximum(far, 1.0)[:, None]
     log_radius = np.log(skeleton.radius) + np.clip(step[:, 3], -_CHANGE, _CHANGE)
     return replace(skeleton.moved(skeleton.nodes + move), radius=np.exp(
-        _falling(log_radius, own.diagonal()[3::4] + 1.0, skeleton.parent))).on_grid()
-
-
-def _falling(value: np.ndarray, weight: np.ndarray, parent: np.ndarray) -> np.ndarray:
-    """The nearest values [n] that nowhere rise away from the root: a few far points would swell a
-    twig. Least squares with weights [n] on a rooted tree (Pardalos and Xue 1999)."""
-    total, mass = (weight * value).tolist(), weight.tolist()
-    block = list(range(len(total)))  # the uppermost node of each node's block, or one of its block
-    below: list[list[int]] = [[] for _ in total]
-    for node in range(len(total) - 1, -1, -1):
-        while below[node]:
-            most = max(below[node], key=lambda each: total[each] / mass[each])
-            if total[most] / mass[most] <= total[node] / mass[node]:
-                break
-            total[node] += total[most]
-            mass[node] += mass[most]
-            block[most] = node
-            below[node].remove(most)
-            below[node] += below[most]
-        if node:
-            below[parent[node]].append(node)
-    for node in range(1, len(total)):
-        block[node] = block[block[node]]
-    return np.array([total[each] / mass[each] for each in block])
+        falling(log_radius, own.diagonal()[3::4] + 1.0, skeleton.parent))).on_grid()
 
 
 @dataclass(frozen=True)
@@ -221,21 +204,47 @@ def _padded(matrix: sparse.csr_matrix, more: int) -> sparse.csr_matrix:
     return matrix
 
 
-def _places(axes: np.ndarray, normal: np.ndarray, sharpness: np.ndarray, scan: PointLikelihood,
-            across: np.ndarray) -> np.ndarray:
-    """Mean direction [m, 3] from the axis to where each point is on the skin, given where it was
-    measured: a von Mises distribution of this ``sharpness``, and what the sensor sees. ``across``
-    [m, 3] is the direction around the axis."""
-    if scan.sight is None:
-        return (i1e(sharpness) / i0e(sharpness))[:, None] * normal
-    facing, aside = (scan.facing(axes, ways) for ways in (normal, across))
-    turn = np.minimum(_WIDE / np.sqrt(np.maximum(sharpness, 1e-300)), np.pi)[:, None] * _POSITIONS
-    seen = np.maximum(facing[:, None] * np.cos(turn) + aside[:, None] * np.sin(turn), 0.0)
-    density = (HIDDEN + (1 - HIDDEN) * np.pi * seen) * np.exp(
-        sharpness[:, None] * (np.cos(turn) - 1))
-    density /= density.sum(axis=1)[:, None]
-    return (np.sum(density * np.cos(turn), axis=1)[:, None] * normal
-            + np.sum(density * np.sin(turn), axis=1)[:, None] * across)
+def _all_around(skeleton: Skeleton, match: Match, axes: np.ndarray, weight: np.ndarray,
+                ) -> tuple[sparse.csc_matrix, np.ndarray]:
+    """Normal equations of axes and radii, given where on the skin each point was: the mean of a von
+    Mises distribution about where it was measured, with ``weight`` [1/m^2], shape [m]."""
+    distance = np.maximum(match.residual + match.thick, 1e-12)
+    sharpness = distance * match.thick * weight
+    mean = i1e(sharpness) / i0e(sharpness)
+    firm = np.maximum(1 - match.thick * mean / distance, _FIRM)
+    return held_by_points(
+        skeleton.parent, match, weight, match.normal,
+        np.sqrt(firm)[:, None] * np.cross(axes, match.normal),
+        (distance - match.thick * mean)[:, None] * match.normal, distance * mean - match.thick)
+
+
+def _by_rays(skeleton: Skeleton, match: Match, axes: np.ndarray, weight: np.ndarray,
+             variance: np.ndarray, scan: PointLikelihood) -> tuple[sparse.csc_matrix, np.ndarray]:
+    """Normal equations of axes and radii by moments of a sensor's rays: across its sight they are
+    even from edge to edge, and along it at the front. ``variance`` [m^2] is that along the sight,
+    and points have weights, shape [m] each."""
+    towards, open_ = scan.across(axes)
+    towards = np.where(np.isnan(towards), match.normal, towards)
+    beside, thick = np.cross(axes, towards), match.thick
+    aside, deep = ((match.residual + thick) * np.einsum("mj,mj->m", match.normal, way)
+                   for way in (beside, towards))
+    across = scan.sharp**2 * variance
+    along = open_**2 * variance + (1 - open_**2) * across
+    # The mean of a point's distance beside the axis, how that goes with the radius, its variance.
+    mean = np.sqrt(thick**2 / 4 + 2 / np.pi * across)
+    slope = thick / (4 * mean)
+    spread = thick**2 / 12 + (1 - 2 / np.pi) * across
+    firm = spread / slope**2 / (thick**2 / 3 + across)
+    known = 1 / (1 + 3 * across / thick**2)
+    front = np.sqrt(1 - known * np.minimum((aside / thick)**2, 1.0) - (1 - known) / 3)
+    rise = (2 + known) / (3 * np.maximum(front, _STEEP))
+    miss = (deep - thick * front) / rise
+    one, other = (held_by_points(skeleton.parent, match, *terms) for terms in (
+        (weight * slope**2 / spread, 0 * beside, np.sqrt(firm)[:, None] * beside,
+         (firm * aside)[:, None] * beside, (np.abs(aside) - mean) / slope),
+        (weight * rise**2 / along, towards / rise[:, None], 0 * towards,
+         (miss / rise)[:, None] * towards, miss)))
+    return one[0] + other[0], one[1] + other[1]
 
 
 # Proposals: each changes the density of few points, the length, and the bends.
@@ -385,8 +394,9 @@ class _Twigs:
         distance = np.append(0.0, np.geomspace(scan.noises[0] / 2, 33 * scan.noises[-1], _TABLE))
         facing = np.linspace(-1, 1, _FACINGS) if scan.sight is not None else np.full(1, np.nan)
         grid = np.array(np.meshgrid(radius, facing, distance, indexing="ij"))
-        density = densities(grid[2].ravel(), grid[0].ravel(), grid[1].ravel(), scan.noises,
-                            scan.power) @ state.scatter.shares
+        density = densities(grid[2].ravel(), grid[0].ravel(), grid[1].ravel(),
+                            np.ones(grid[0].size), scan.noises, scan.power, scan.sharp,
+                            ) @ state.scatter.shares
         table = np.log(np.maximum(density, 1e-300)).reshape(grid.shape[1:])
         return _raised(
             skeleton.nodes[self.foot], self.end, self.radius, table_of, scan.power, table,

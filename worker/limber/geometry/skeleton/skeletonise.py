@@ -140,8 +140,8 @@ class _Search:
         def lead(scan: PointLikelihood) -> float:
             return scan.score(best) - (scan.score(fitted.skeleton) + scan.score(wood)) / 2
 
-        if lead(scan) > 0:
-            scan = scan.where_seen(wood)
+        if lead(scan) > 0 and (seen := scan.where_seen(wood)).score(wood) > scan.score(wood):
+            scan = seen
         # As in the shape, neighbours count once where they speak for wood.
         return best if max(lead(scan), lead(scan) / ALIKE) + shape > 0 else None
 

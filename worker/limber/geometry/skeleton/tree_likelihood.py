@@ -6,16 +6,15 @@ s is Rice's: (2 pi s^2)^-1 exp(-(d^2 + r^2) / 2 s^2) I0(d r / s^2) at the distan
 needs points around its section and none inside, and a cylinder that is too thick, or goes through
 several twigs, is not flattered. On the tree's skin, or along its axes, points are evenly spread:
 more axes must show more points. The noise differs from point to point by Student's distribution. A
-sensor at one place sees points evenly spread across its sight: on a skin by the cosine of the angle
-to it. Twigs cost what their numbers do, and bends what they do by the prior of wood.
+sensor at one place sees points evenly spread across its sight, from edge to edge of a branch, and
+they err along it more than across. Twigs cost what their numbers do, and bends what they do by the
+prior of wood.
 """
 
 from dataclasses import dataclass, replace
-from operator import itemgetter
 
 import numpy as np
 
-from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.likelihood_kernels import densities
 from limber.geometry.skeleton.radii.fit_kernels import Match, match_cylinders
 from limber.geometry.skeleton.radii.wood import Bends
@@ -23,12 +22,14 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 _DIRECTIONS = [way / np.linalg.norm(way) for way in np.argwhere(np.ones((3, 3, 3))) - 1.0
                if way.any()]  # to the faces, edges and corners of a cube
-_TURN, _HALVINGS = 0.35, 3  # first step of the search for the sensor [rad; 1 / size]; smaller ones
+_SHARP = 0.5  # noise across a sensor's sight over that along it, while its direction is sought
+_TURNS = (0.3, 0.1)  # steps of the search for the sensor [rad; 1 / size], and factors of that ratio
+_SHARPER = (0.5, 0.7, 1.4, 2.0)
 _NOISES = np.geomspace(2e-4, 0.03, 24)  # fractions of the scan's diagonal
 _FREEDOM = 4.0  # of Student's distribution of the noise
 _BACKGROUND, _ROUNDS = 0.05, 4  # first share of the background; rounds that find it
 _MARGIN = 0.02  # [m] around the scan where background may be
-_OPEN = 0.2  # sine of the angle between axis and sight under which an axis has no seen half
+_OPEN = 0.2  # sine of the angle between axis and sight under which an axis has no side
 # A twig's fork, direction (2), length, radius and bend: each costs half the logarithm of the points
 # (Schwarz 1978, Bayes' information criterion).
 _TWIG_NUMBERS = 6.0
@@ -52,6 +53,8 @@ class PointLikelihood:
         noises: Standard deviations across the axes that occur [m], shape [k].
         volume: Where background may be [m^3].
         sight: Unit vectors from points to the sensor, shape [m, 3]; None: seen from all around.
+        sharp: Noise across the sight over that along it.
+        sensor: Direction [3] and nearness, as in :meth:`seen_from`; None: seen from all around.
         power: Of the radius, by which axes show points: 1 by their skin's area, 0 by their length.
         twig_numbers: What a twig costs, in halves of the logarithm of the number of points.
     """
@@ -60,6 +63,8 @@ class PointLikelihood:
     noises: np.ndarray
     volume: float
     sight: np.ndarray | None = None
+    sharp: float = 1.0
+    sensor: tuple[np.ndarray, float] | None = None
     power: float = 1.0
     twig_numbers: float = _TWIG_NUMBERS
 
@@ -69,43 +74,45 @@ class PointLikelihood:
         size = np.ptp(points, axis=0)
         return cls(points, _NOISES * float(np.linalg.norm(size)), float(np.prod(size + _MARGIN)))
 
-    def seen_from(self, direction: np.ndarray, near: float = 0.0) -> "PointLikelihood":
+    def seen_from(self, direction: np.ndarray, near: float = 0.0, sharp: float = 1.0,
+                  ) -> "PointLikelihood":
         """The same for a sensor in a ``direction`` [3] from the middle of the points, by their size
-        over ``near`` away."""
+        over ``near`` away, whose noise across its sight is ``sharp`` times that along it."""
+        direction = direction / np.linalg.norm(direction)
         size = float(np.linalg.norm(np.ptp(self.points, axis=0)))
         way = direction - near / size * (self.points - self.points.mean(axis=0))
-        return replace(self, sight=way / np.linalg.norm(way, axis=1)[:, None])
+        return replace(self, sight=way / np.linalg.norm(way, axis=1)[:, None], sharp=sharp,
+                       sensor=(direction, near))
 
     def match(self, skeleton: Skeleton, near: np.ndarray | None = None,
               some: np.ndarray | slice = slice(None)) -> Match:
         """The cylinder of each or ``some`` of the points, of those of the upper nodes ``near``."""
-        return match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                               self.points[some], near)
+        return match_cylinders(skeleton, self.points[some], near)
 
     def axes(self, skeleton: Skeleton, match: Match) -> np.ndarray:
         """Unit vector along the axis of each point's cylinder, shape [m, 3]."""
         axis = skeleton.nodes[match.segment] - skeleton.nodes[skeleton.parent[match.segment]]
         return axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
 
-    def facing(self, axes: np.ndarray, ways: np.ndarray, some: np.ndarray | slice = slice(None),
-               ) -> np.ndarray:
-        """Cosine of the angle around the ``axes`` between the sensor and ``ways`` across them at
-        ``some`` of the points [m, 3], shape [m]; 0 where it looks along them; NaN: all around."""
+    def across(self, axes: np.ndarray, some: np.ndarray | slice = slice(None),
+               ) -> tuple[np.ndarray, np.ndarray]:
+        """Unit vectors across the ``axes`` towards the sensor at ``some`` of the points [m, 3], NaN
+        where it looks along them or around; and the sines between axes and sight [m]."""
         if self.sight is None:
-            return np.full(len(ways), np.nan)
+            return np.full(axes.shape, np.nan), np.zeros(len(axes))
         sight = self.sight[some]
         sight = sight - np.einsum("mj,mj->m", axes, sight)[:, None] * axes
         size = np.linalg.norm(sight, axis=1)
-        return np.where(size > _OPEN, np.einsum("mj,mj->m", ways, sight)
-                        / np.maximum(size, _OPEN), 0.0)
+        return np.where(size > _OPEN, 1 / np.maximum(size, _OPEN), np.nan)[:, None] * sight, size
 
     def densities(self, skeleton: Skeleton, match: Match, some: np.ndarray | slice = slice(None),
                   ) -> np.ndarray:
         """Density across the axes at ``some`` of the points, times a power of their radii, for
         each noise, shape [m, k]."""
+        towards, open_ = self.across(self.axes(skeleton, match), some)
         return densities(np.maximum(match.residual + match.thick, 0.0), match.thick,
-                         self.facing(self.axes(skeleton, match), match.normal, some), self.noises,
-                         self.power)
+                         np.einsum("mj,mj->m", match.normal, towards), open_, self.noises,
+                         self.power, self.sharp)
 
     def scattered(self, skeleton: Skeleton, density: np.ndarray) -> Scatter:
         """The likeliest scatter for densities [m, k] across the axes of a tree."""
@@ -150,26 +157,25 @@ class PointLikelihood:
         return self.log(density @ scatter.shares, scatter, float(self.skin(skeleton).sum()),
                         skeleton.branch_count) - bends
 
-    def where_seen(self, skeleton: Skeleton) -> "PointLikelihood":
-        """The same for a sensor where a tree scores most, or itself, seen from all around."""
-        def scored(direction: np.ndarray, near: float = 0.0) -> tuple[float, np.ndarray, float]:
-            direction = direction / np.linalg.norm(direction)
-            return self.seen_from(direction, near).score(skeleton, match), direction, near
+    def roughly(self, skeleton: Skeleton, match: Match) -> float:
+        """The score with a third of the noises: sensors differ by far more than that changes it."""
+        return replace(self, noises=self.noises[::3]).score(skeleton, match)
 
+    def where_seen(self, skeleton: Skeleton) -> "PointLikelihood":
+        """The same for the sensor of those all around with which a tree scores most."""
         match = self.match(skeleton)
-        score, direction, near = max(map(scored, _DIRECTIONS), key=itemgetter(0))
-        if score <= self.score(skeleton, match) + self.twig_cost:  # it has three numbers too
+        return max((self.seen_from(way, sharp=_SHARP) for way in _DIRECTIONS),
+                   key=lambda one: one.roughly(skeleton, match))
+
+    def turned(self, skeleton: Skeleton) -> "PointLikelihood":
+        """The same for a sensor beside, with which a tree scores most; itself if none scores more.
+        """
+        if self.sensor is None:
             return self
-        step, halvings = _TURN, 0
-        while halvings < _HALVINGS:
-            beside = any_normal(direction)
-            above = np.cross(direction, beside)
-            best = max([scored(direction + turn * step, near)
-                        for turn in (beside, -beside, above, -above)]
-                       + [scored(direction, max(near + closer, 0.0)) for closer in (step, -step)],
-                       key=itemgetter(0))
-            if best[0] > score:
-                score, direction, near = best
-            else:
-                step, halvings = step / 2, halvings + 1
-        return self.seen_from(direction, near)
+        match, (direction, near), still = self.match(skeleton), self.sensor, np.zeros(3)
+        changes = [(turn * step, 0.0, 1.0) for turn in (*np.eye(3), *-np.eye(3)) for step in _TURNS]
+        changes += [(still, closer, 1.0) for closer in (_TURNS[0], -_TURNS[0])]
+        changes += [(still, 0.0, sharper) for sharper in _SHARPER]
+        return max([self, *(self.seen_from(direction + turn, max(near + closer, 0.0), min(
+            self.sharp * sharper, 1.0)) for turn, closer, sharper in changes)],
+                   key=lambda one: one.roughly(skeleton, match))

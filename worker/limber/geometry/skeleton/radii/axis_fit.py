@@ -224,8 +224,15 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
     """Set up a round: points, smoothness of runs, constraints on bare nodes. ``positions`` [m, 3]
     are mean directions of true positions (None: the nearest), ``targets`` where points should lie
     (None: at the radius), ``across`` [m, 3] how firmly they hold the axis across (None: not)."""
-    data, right, per_node = data_terms(skeleton.parent, nodes, match, weight, positions, targets,
-                                        across)
+    parent, count, distance = skeleton.parent, len(nodes), match.residual + match.thick
+    targets = TargetDistances(match.thick, match.thick) if targets is None else targets
+    positions = match.normal if positions is None else positions
+    data, right = held_by_points(
+        parent, match, weight, match.normal, 0 * match.normal if across is None else across,
+        distance[:, None] * match.normal - targets.axis[:, None] * positions,
+        distance * np.einsum("mj,mj->m", match.normal, positions) - targets.radius)
+    per_node = np.bincount(match.segment, weight * match.share, count)
+    per_node += np.bincount(parent[match.segment], weight * (1 - match.share), count)
     smooth = smoothness(skeleton, nodes, radius, per_node, noise, stepped)
     state = np.column_stack([nodes, radius]).ravel()
     matrix = (data + smooth + _anchor(skeleton, nodes, per_node)).tocsc()
@@ -247,8 +254,7 @@ def fitted_system(skeleton: Skeleton, points: np.ndarray) -> tuple[NormalEquatio
 def _systems(skeleton: Skeleton, points: np.ndarray, stepped: tuple[bool, ...],
              ) -> tuple[list[NormalEquations], float]:
     """The normal equations at the end of a fit, without or with steps at forks; their noise [m]."""
-    match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                            points)
+    match = match_cylinders(skeleton, points)
     noise = max(robust_sigma(match.residual, match.thick), 1e-12)
     weight = settled_weights(match.residual, noise)
     return [normal_equations(skeleton, skeleton.nodes, skeleton.radius, match, weight, noise,
@@ -291,33 +297,25 @@ def fit_with_steps(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, np
             covariance + more[:, None, None] * way[:, :, None] * way[:, None, :])
 
 
-def data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
-                positions: np.ndarray | None, targets: TargetDistances | None,
-                across: np.ndarray | None,
-                ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
-    """Normal equations of the residuals in (x, y, z, r) of both ends, and weight per node."""
-    count = len(nodes)
-    targets = TargetDistances(match.thick, match.thick) if targets is None else targets
-    across = np.zeros_like(match.normal) if across is None else across
-    positions = match.normal if positions is None else positions
+def held_by_points(parent: np.ndarray, match: Match, weight: np.ndarray, normal: np.ndarray,
+                   across: np.ndarray, pull: np.ndarray, grow: np.ndarray,
+                   ) -> tuple[sparse.csc_matrix, np.ndarray]:
+    """Normal equations of residuals in (x, y, z, r) of n nodes, [4 n, 4 n] and [4 n]: each point
+    holds its axis along ``normal`` [m, 3], there with its radius, and ``across`` [m, 3], and pulls
+    the axis [m, 3] and the radius [m]."""
+    count = len(parent)
     low = np.where(match.own_radius, 0.0, 1 - match.share)
     high = np.where(match.own_radius, 1.0, match.share)
-    distance = match.residual + match.thick
-    pull = distance[:, None] * match.normal - targets.axis[:, None] * positions
-    grow = distance * np.einsum("mj,mj->m", match.normal, positions) - targets.radius
     gradient = np.column_stack([
         (1 - match.share)[:, None] * pull, low * grow, match.share[:, None] * pull, high * grow])
-    block, right = normal_blocks(match.segment, match.share, low, high, match.normal, across,
+    block, right = normal_blocks(match.segment, match.share, low, high, normal, across,
                                  gradient, weight, count)
     ends = np.arange(1, count)
     index = (4 * np.stack([parent[ends], ends], axis=1)[:, :, None] + np.arange(4)).reshape(-1, 8)
     rows = np.repeat(index, 8, axis=1).ravel()
     columns = np.tile(index, (1, 8)).ravel()
     matrix = sparse.coo_matrix((block[1:].ravel(), (rows, columns)), (4 * count, 4 * count))
-    vector = np.bincount(index.ravel(), right[1:].ravel(), 4 * count)
-    per_node = np.bincount(match.segment, weight * match.share, count)
-    per_node += np.bincount(parent[match.segment], weight * (1 - match.share), count)
-    return matrix.tocsc(), vector, per_node
+    return matrix.tocsc(), np.bincount(index.ravel(), right[1:].ravel(), 4 * count)
 
 
 def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> sparse.csc_matrix:
@@ -411,7 +409,7 @@ class _Rounds:
     def result(self, uncertainty: bool) -> AxisFit:
         """Result of the fit; with ``uncertainty`` each radius's standard deviation too."""
         nodes, radius, start = self._nodes, self._radius, self._start
-        match = match_cylinders(start.parent, start.order, nodes, radius, self._points)
+        match = match_cylinders(replace(start, nodes=nodes, radius=radius), self._points)
         noise = robust_sigma(match.residual, match.thick)
         weight = settled_weights(match.residual, noise)
         seen, *_ = self._sides(match, weight, noise)
@@ -435,7 +433,7 @@ class _Rounds:
         if self._near is None or (moved > _MOVED * self._radius).any():
             self._near = cylinders_around(start.parent, nodes, self._points)
             self._found_at = nodes
-        return match_cylinders(start.parent, start.order, nodes, self._radius, self._points,
+        return match_cylinders(replace(start, nodes=nodes, radius=self._radius), self._points,
                                self._near)
 
     def _sides(self, match: Match, weight: np.ndarray, noise: float,

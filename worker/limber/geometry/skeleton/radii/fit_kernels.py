@@ -27,19 +27,6 @@ _reach = Kernel(
     "out by_limit float64[points]", "limit float", "least float")
 
 
-def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_radius: np.ndarray,
-               nodes: np.ndarray, radius: np.ndarray,
-               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Find the cylinder nearest to each of m points among k candidates: its upper node, the
-    fraction of the path to it, unit vector from the axis [m, 3], distance from the surface [m],
-    positive outside, and radius. ``own_radius``: the cylinder has its upper node's throughout."""
-    count = len(points)
-    found = (np.empty(count, np.int64), np.empty(count), np.empty((count, 3)), np.empty(count),
-             np.empty(count))
-    _nearest.of(points, near, parent, own_radius, nodes, radius, *found)
-    return found
-
-
 def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high: np.ndarray,
                   normal: np.ndarray, across: np.ndarray, gradient: np.ndarray,
                   weight: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -79,8 +66,7 @@ def nearest_cylinders(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarra
     """Return for each point the node whose cylinder is nearest, and its distance [m] from it."""
     segments, residuals = [], []
     for begin in range(0, len(points), 100_000):
-        match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                                points[begin:begin + 100_000])
+        match = match_cylinders(skeleton, points[begin:begin + 100_000])
         segments.append(match.segment)
         residuals.append(match.residual)
     return np.concatenate(segments), np.concatenate(residuals)
@@ -96,8 +82,7 @@ def on_cylinders(skeleton: Skeleton, points: np.ndarray,
     """Lower and upper node of the cylinder nearest to each point, or around it, the fraction of the
     path between them (1 in the first of a twig, which has the twig's radius), and the vector from
     the axis to the point [m]."""
-    match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                            points)
+    match = match_cylinders(skeleton, points)
     low, high = skeleton.parent[match.segment], match.segment
     foot = (1 - match.share)[:, None] * skeleton.nodes[low] + match.share[:, None] * (
         skeleton.nodes[high])
@@ -118,15 +103,17 @@ class Match:
     own_radius: np.ndarray
 
 
-def match_cylinders(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, radius: np.ndarray,
-                    points: np.ndarray, near: np.ndarray | None = None) -> Match:
+def match_cylinders(skeleton: Skeleton, points: np.ndarray, near: np.ndarray | None = None,
+                    ) -> Match:
     """Find the cylinder whose surface is nearest to each point, among those of the upper nodes
     ``near`` [m, k]; None: those nearby."""
-    near = cylinders_around(parent, nodes, points) if near is None else near
+    parent, count = skeleton.parent, len(points)
+    near = cylinders_around(parent, skeleton.nodes, points) if near is None else near
     # The first cylinder of a side run has the twig's radius throughout, not its carrier's.
-    own = order > order[parent]
-    segment, share, normal, residual, thick = nearest_of(points, near, parent, own, nodes, radius)
-    return Match(segment, share, normal, residual, thick, own[segment])
+    own = skeleton.order > skeleton.order[parent]
+    found = np.empty(count, np.int64), np.empty(count), np.empty((count, 3)), *np.empty((2, count))
+    _nearest.of(points, near, parent, own, skeleton.nodes, skeleton.radius, *found)
+    return Match(*found, own[found[0]])
 
 
 def cylinders_around(parent: np.ndarray, nodes: np.ndarray, points: np.ndarray,
