@@ -107,12 +107,12 @@ def match_cylinders(skeleton: Skeleton, points: np.ndarray, near: np.ndarray | N
                     ) -> Match:
     """Find the cylinder whose surface is nearest to each point, among those of the upper nodes
     ``near`` [m, k]; None: those nearby."""
-    parent, count = skeleton.parent, len(points)
-    near = cylinders_around(parent, skeleton.nodes, points) if near is None else near
+    near = cylinders_around(skeleton.parent, skeleton.nodes, points) if near is None else near
     # The first cylinder of a side run has the twig's radius throughout, not its carrier's.
-    own = skeleton.order > skeleton.order[parent]
-    found = np.empty(count, np.int64), np.empty(count), np.empty((count, 3)), *np.empty((2, count))
-    _nearest.of(points, near, parent, own, skeleton.nodes, skeleton.radius, *found)
+    own = skeleton.order > skeleton.order[skeleton.parent]
+    share, residual, thick = np.empty((3, len(points)))
+    found = np.empty(len(points), np.int64), share, np.empty((len(points), 3)), residual, thick
+    _nearest.of(points, near, skeleton.parent, own, skeleton.nodes, skeleton.radius, *found)
     return Match(*found, own[found[0]])
 
 
