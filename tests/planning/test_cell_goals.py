@@ -161,8 +161,7 @@ def test_states_of_a_plan_refine_the_border(field, small_model):
     wrong = replace(states, poses=states.poses + [0, 0.02, 0, 0, 0, 0],
                     tips=states.tips + [0, 0.03, 0])
     right = replace(states, tips=states.tips - [0, 0.03, 0])
-    found = goal.drawn_in(wrong)
-    assert len(found.refused) > len(goal.refused) and 0 < len(found.taken) <= 16
+    assert len(goal.drawn_in(wrong).refused) > len(goal.refused)
     assert len(goal.drawn_in(right).taken) == len(goal.taken) + 1
     points = field.region.draw(1000, np.random.default_rng(5))
     closer = goal.drawn_in(wrong).distance(field, points) <= goal.tolerance
@@ -190,14 +189,18 @@ def test_large_goals_are_aimed_at_from_the_near_side(field, small_model):
     assert away.min() <= 1.02 * np.linalg.norm(inside - start, axis=1).min()
 
 
-def test_a_region_that_no_draw_comes_near_is_found_from_the_samples(field, monkeypatch):
-    """The tip of a state of the full model is reachable, however small the region about it."""
+def test_a_region_that_no_draw_comes_near_is_found_from_the_samples(field, small_model,
+                                                                    monkeypatch):
+    """The tip of a state of the full model is reachable, however small the region about it; into
+    one beside it the branch model leads."""
     monkeypatch.setattr(TargetGoal, "_walked", lambda self, field, points, generator: points)
     inner = field.samples.positions[field.region.contains(field.samples.positions)]
     tip = field.tip(inner[[5]])[0]
     goal = TargetGoal(Ball(tuple(map(float, tip)), 1e-5))
     assert np.allclose(goal_points(goal, field, field.limited(), count=20), inner[5], atol=1e-3)
     assert np.linalg.norm(goal.centre(field) - inner[5]) < 1e-3
+    beside = TargetGoal(Ball(tuple(tip + [0.004, 0.0, 0.0]), 5e-4))
+    assert beside.missed_by(beside.grown(field, small_model).samples) <= 0.0
 
 
 def test_walking_into_a_large_region_stays_among_the_samples(field):

@@ -282,12 +282,13 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     """
     own = Limits.of(settings)
     goal = goal_of(GoalRequest(field, grasp_model, settings, own.on(field), cell or {}))
+    if isinstance(goal, TargetGoal):
+        field = goal.grown(field, grasp_model)
     start, limits = start_of(field, goal, settings), limits or own
     if limits.constraints:
         field = with_constraints(field, grasp_model, limits, workers, progress)
-    aim = goal
-    if isinstance(goal, TargetGoal):
-        aim = goal.with_margin(field, limits.on(field), start)
+    aim = goal.with_margin(field, limits.on(field), start) if isinstance(
+        goal, TargetGoal) else goal
     rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, aim,
                      limits, pace or Pace(settings.speed), progress)
     count = _REPLANS + 1

@@ -17,7 +17,6 @@ to an obstacle, 1 where it touches one. A plan's constraints may add more.
 """
 Known = Any
 """An array, or None where it is not known."""
-_NO_POSES = np.empty((0, 6))
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class States:
     forces: np.ndarray
     tips: np.ndarray
     min_det_f: np.ndarray
-    rejected_poses: np.ndarray = field(default_factory=_NO_POSES.copy)
+    rejected_poses: np.ndarray = field(default_factory=lambda: np.empty((0, 6)))
     strains: Known = None
     targets: Known = None
     torques: Known = None

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
-from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.energy_field import EnergyField, FieldArrays, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import solve_branch
 from limber.planning.field.stored_states import States
@@ -96,6 +96,7 @@ _SHARES = (1.0, 0.5, 0.2)  # fractions of the margin that are tried
 _DRAWN = 200  # poses with which they are
 _SMALL = 0.02  # [m] depth of a region up to which targets are drawn in all of it
 _HALVINGS = 12  # halvings of a path into a region
+_GROWN = 8  # most states of the branch model towards a region
 
 
 @dataclass(frozen=True)
@@ -208,6 +209,25 @@ class TargetGoal:
                 positions + middle[:, None] * (is_inside - positions)) <= -inside
             low, high = np.where(deep, low, middle), np.where(deep, middle, high)
         return positions + high[:, None] * (is_inside - positions)
+
+    def grown(self, field: EnergyField, grasp_model: GraspModel) -> EnergyField:
+        """Return the field with states of the branch model on the way from the sample nearest to
+        the region into it, where the field has no pose in it; as it is if the way does not end
+        there."""
+        drawn = self.guess(field, _DRAWN, np.random.default_rng(0))
+        nearest = int(self.region.distance(self.target_positions(field.samples)).argmin())
+        place, states = field.samples.positions[nearest][None], list[States]()
+        while len(states) < _GROWN and (self.distance(field, drawn) > self.tolerance).all():
+            found = solve_branch(grasp_model, place, workers=1)[0]
+            if not found:
+                break
+            states.append(found[0].state)
+            if len(states) > 1 and self.missed_by(states[-1]) <= 0.0:
+                return refit(field, States.joined(*states[1:]))
+            tip = self.target_positions(states[-1])
+            place = place + _damped_steps(field.tip_gradient(place, self.target),
+                                          self._entered(tip, self.region.middle[None]) - tip)
+        return field
 
     def centre(self, field: EnergyField) -> np.ndarray:
         points = self.guess(field, 50, np.random.default_rng(0))

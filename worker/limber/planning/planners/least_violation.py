@@ -57,9 +57,8 @@ def easiest_path(field: EnergyField, limits: FieldArrays, start: np.ndarray, goa
             break
         cells = cells.take(lower).cut(parts)
     some = shares <= level
-    within = cells.take(some)
-    dear = 1.0 + _DEARER * np.maximum(shares[some] - 1.0, 0.0)
-    path = within.path((np.arange(len(some)) == first)[some], ends[some], dear)
+    path = cells.take(some).path((np.arange(len(some)) == first)[some], ends[some],
+                                 1.0 + _DEARER * np.maximum(shares[some] - 1.0, 0.0))
     if path is None:
         return None
     # Along the shell: chords are well off it.
