@@ -121,7 +121,7 @@ def test_branches_are_no_sheets():
         assert prepare(Cloud(flat), 1.0).counts.get("sheets", 0) == 0, spec
 
 
-@pytest.mark.parametrize("count", [400, 1400, 20_000])
+@pytest.mark.parametrize("count", [120, 400, 1400, 20_000])
 def test_a_fan_is_no_wall_and_a_shadowed_wall_is(count):
     """Twigs side by side in a plane fill it by cells of few points; once they were taken out. A
     wall with the shadows of twigs is one, however few of its points were scanned."""

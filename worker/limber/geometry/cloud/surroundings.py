@@ -327,7 +327,9 @@ def _line(level: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 _SAMPLE = 400
 _PLANE_POINTS = 150  # fewest points that define a plane
-_REACH = 0.05  # neighbourhood of a point, as a fraction of the cloud's diagonal
+# Neighbourhood of a point, as a fraction of the cloud's diagonal, and at least in spacings of all
+# points, were they spread evenly over a square as wide.
+_REACH, _WIDE = 0.05, 1.5
 _FLAT, _ELONGATED = 0.01, 0.3  # variance across and along a sheet, over the next larger
 _TRIES = 200
 _IN_PLANE = 3  # fewest flat neighbourhoods that span a plane
@@ -346,7 +348,7 @@ def find_sheet(points: np.ndarray, least: float) -> Sheet | None:
     """Return the largest plane that points [n, 3] [m] may fill in both directions; None if none has
     ``least`` points."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    reach = _REACH * diagonal
+    reach = diagonal * max(_REACH, _WIDE / np.sqrt(len(points)))
     order, rng = own_order(points), np.random.default_rng(0)
     sample = order[:_SAMPLE]
     # Tested on as many points as the sample needs; fewer points do not make a sheet less flat.
