@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 DATA = Path(__file__).parent / "data"
-URSIM = DATA / "ursim.json"
+URSIM = DATA / "ursim.jsonl"
+"""A line for each run against the maker's simulator."""
 
 CHAPTERS = {
     "scans": ("Skeletons, radii and volume", (
@@ -95,16 +96,15 @@ def log_ursim(address: str, model: str, passed: bool) -> None:
     """Log a run of the tests against the maker's simulator there, for the page."""
     from limber.robot.ur.rtde import Dashboard
 
-    runs = json.loads(URSIM.read_text(encoding="utf-8"))
-    with closing(Dashboard(address)) as dashboard:
-        runs.append({"date": datetime.date.today().isoformat(), "model": model,
-                     "version": dashboard.ask("PolyscopeVersion"), "passed": passed})
-    URSIM.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
+    with closing(Dashboard(address)) as dashboard, open(URSIM, "a", encoding="utf-8") as runs:
+        runs.write(json.dumps({
+            "date": datetime.date.today().isoformat(), "model": model,
+            "version": dashboard.ask("PolyscopeVersion"), "passed": passed}) + "\n")
 
 
 def _ursim() -> str:
     """Return when the maker's simulator was last asked, and what came of it."""
-    runs = json.loads(URSIM.read_text(encoding="utf-8"))
+    runs = map(json.loads, URSIM.read_text(encoding="utf-8").splitlines())
     told = "; ".join(f"{run['date']}: {run['model']}, {run['version']}, "
                      f"{'passed' if run['passed'] else '**failed**'}" for run in runs)
     return (f"Universal Robots' own simulator (`LIMBER_URSIM=ADDRESS scripts/test "
