@@ -30,6 +30,9 @@ def test_files_alone_are_checked_without_a_robot(branch_folder, tmp_path, capfd)
                     "base = {pose = [0.6, 0, 0, 0, 0, 0]}\n")
     code, told = checked(capfd, path, "--offline")
     assert code == 2 and "states no sensor.topic" in told["error"]
+    path.write_text(path.read_text().replace("9090'", "9090', ros = {trajectry = '/go'}"))
+    code, told = checked(capfd, path, "--offline")
+    assert code == 2 and "[robot.ros] states trajectry" in told["error"]
     path.write_text("[robot]\nmodel = 'ur9'\n")
     assert checked(capfd, path, "--offline")[0] == 2
 

@@ -1,5 +1,6 @@
 """Arms of URDF files: a UR5's against its analytic kinematics, one of seven joints, bad files."""
 
+import re
 import shutil
 
 import numpy as np
@@ -18,6 +19,8 @@ from limber.robot.driver.controls import control_of
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.joint_path import follow, joint_path
 from limber.robot.motion.trajectory import densely
+from limber.robot.ros.cell_description import joint_names
+from limber.robot.ros.messages import JointStates
 from limber.robot.virtual.controller import Controller
 from limber.store import Branch
 
@@ -52,6 +55,20 @@ def test_a_ur5s_file_has_the_analytic_kinematics(arm):
     assert arm.joint_speed == pytest.approx(UR5.joint_speed)
     assert arm.joint_limits[[0, 1, 3, 4, 5]] == pytest.approx(UR5.joint_limits[[0, 1, 3, 4, 5]])
     assert arm.joint_limits[2] == pytest.approx([-np.pi, np.pi])
+
+
+@pytest.mark.parametrize("tip", ["", "#left_tool0"])
+def test_an_arm_with_a_prefix_is_the_same_arm(arm, ur5_file, tmp_path, tip):
+    """Base and flange are found by their usual names; joints that have the prefix get no second."""
+    path = tmp_path / "left.urdf"
+    path.write_text(re.sub(r'((?:name|link)=")(?!world)', r"\1left_", ur5_file.read_text("utf-8")),
+                    encoding="utf-8")
+    left = arm_named(f"{path}{tip}")
+    assert np.abs(left.forward(random_joints(20)) - arm.forward(random_joints(20))).max() < 1e-12
+    cell = cell_for("127.0.0.1", f"{path}{tip}")
+    cell = cell.model_copy(update={"robot": cell.robot.model_copy(update={
+        "ros": {"prefix": "left_"}})})
+    assert joint_names(cell) == list(left.joint_names) == JointStates(cell, "left_").wanted
 
 
 @pytest.mark.slow

@@ -67,8 +67,8 @@ class _WithoutDoctype(ElementTree.TreeBuilder):
 
 def read_chain(path: Path, tip: str = "") -> Chain:
     """Read the arm of a URDF file, from the link ``base`` (else the root) to ``tip``, or else to
-    ``tool0``, ``flange``, or the first end of its one chain of six or more joints; a gripper's
-    fingers are no part of it. InputError if it cannot be read, or is no such arm."""
+    ``tool0``, ``flange``, each also with a prefix, or the first end of its one chain of six or more
+    joints; fingers are no part of it. InputError if it is unreadable, or no such arm."""
     try:
         # Entities need a document type, which is refused.
         root = ElementTree.XML(read_text(path, "the description of an arm (URDF)"),
@@ -99,14 +99,17 @@ class _Robot:
                          or joint.find("mimic") is not None or joint.get("name") in followed}
 
     def chain(self, tip: str) -> Chain:
-        """The joints from the base to the flange."""
-        base = self._joints_to(_BASE) if _BASE in self._links else []
+        """The joints from the base to the flange; both names may have a prefix."""
+        tip = tip or self._flange()
+        usual = next((name for name in _FLANGES if tip.endswith(name)), tip)
+        name = tip.removesuffix(usual) + _BASE
+        base = self._joints_to(name) if name in self._links else []
         if any(_turns(joint) for joint in base):
-            raise ValueError(f"its link {_BASE!r} is not fixed to the root")
+            raise ValueError(f"its link {name!r} is not fixed to the root")
         frame = inverse_of(functools.reduce(np.matmul, map(_origin, base), np.eye(4)))
         joints: list[Joint] = []
         rods: list[Rod] = []
-        for element in self._joints_to(tip or self._flange()):
+        for element in self._joints_to(tip):
             frame = frame @ _origin(element)
             if _turns(element):
                 joints.append(_joint(element, frame))
@@ -120,8 +123,10 @@ class _Robot:
 
     def _flange(self) -> str:
         for name in _FLANGES:
-            if name in self._links:
-                return name
+            # Of one arm alone, its prefix may stand before it: left_tool0.
+            found = [link for link in self._links if link.endswith(f"_{name}")]
+            if name in self._links or len(found) == 1:
+                return name if name in self._links else found[0]
         parents = {_said(_part(joint, "parent"), "link") for joint in self._above.values()
                    if joint not in self._fingers}
         paths = {name: self._joints_to(name) for name in self._links if name not in parents}

@@ -71,8 +71,9 @@ def cell_srdf(cell: Cell) -> str:
 def joint_names(cell: Cell) -> list[str]:
     """Return the names of the arm's joints in ROS, from the base on; of a URDF file, its own."""
     prefix, is_whole = cell.robot.ros.get("prefix", ""), is_file(cell.robot.model)
-    return [prefix + (name if is_whole or "joint" in name else f"{name}_joint")
-            for name in cell.arm.ros_joints]
+    names = [name if is_whole or "joint" in name else f"{name}_joint"
+             for name in cell.arm.ros_joints]
+    return [name if name.startswith(prefix) else prefix + name for name in names]
 
 
 def link_names(arm: Arm) -> list[str]:

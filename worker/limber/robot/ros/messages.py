@@ -48,7 +48,9 @@ class JointStates:
     of it."""
 
     def __init__(self, cell: Cell, prefix: str = ""):
-        self._arm, self.wanted = cell.arm, [prefix + name for name in cell.arm.ros_joints]
+        # A URDF file's own names may have the prefix already.
+        self._arm, self.wanted = cell.arm, [name if name.startswith(prefix) else prefix + name
+                                            for name in cell.arm.ros_joints]
         self._prefix = prefix
         self._tool = matrices(np.array(cell.tool.grasp_pose))
         self.ordered: list[str] = []

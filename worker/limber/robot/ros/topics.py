@@ -75,15 +75,16 @@ def wrench_topic(cell: Cell, own: str = Topics.wrench) -> str:
     names none that is heard in ROS, or a CB3's own estimate."""
     require_sensor(cell)
     sensor = cell.sensor
-    if sensor.kind == "controller":
+    is_ur = cell.arm.controller == "ur"
+    if sensor.kind == "controller" and (is_ur or sensor.topic):
         return sensor.topic or own
     if sensor.topic is None:
         raise InputError(f"sensor.kind is {sensor.kind}, but the cell file states no sensor.topic.",
-                         f"{own} is not that sensor: there the arm's driver publishes the "
-                         "controller's own force.", "Set sensor.topic to the topic on which the "
+                         f"On {own} a UR arm's driver publishes its controller's own force, and "
+                         "nothing else does.", "Set sensor.topic to the topic on which the "
                          f"sensor's node publishes {WRENCH}; `ros2 topic list -t` lists it.")
     # Under a name space too.
-    if cell.arm.controller == "ur" and sensor.topic.split("/")[-2:] == own.split("/")[-2:]:
+    if is_ur and sensor.topic.split("/")[-2:] == own.split("/")[-2:]:
         measures = cell.arm.measures_force
         raise InputError(f"sensor.kind is {sensor.kind}, but sensor.topic is {sensor.topic}.",
                          "There the UR driver publishes the controller's own force" + (

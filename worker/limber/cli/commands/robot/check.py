@@ -71,12 +71,13 @@ def _from_files(check: Check, cell: Cell, progress: Progress) -> dict[str, Any]:
     """Check a cell, its calibration and a plan without a robot."""
     from limber.cell.cell_file import check_branch
     from limber.cell.obstacles import cell_obstacles
-    from limber.robot.ros.topics import is_ros, wrench_topic
+    from limber.robot.ros.topics import Topics, is_ros, wrench_topic
     from limber.stages.paths.execute import ExecutePlan, planned_motion
     from limber.store import Branch
 
     folder, plan = check.branch, check.plan
     if is_ros(cell):
+        Topics.of_cell(cell)
         wrench_topic(cell)
     for text in _not_stated(cell):
         progress.warn(text)
