@@ -29,10 +29,8 @@ CHAPTERS = {
         "Branches of 300 to 1,500 points with 2 to 3 mm noise and 1 to 3 % stray points, and real "
         "scans that are as sparse, or thinned. No constant was fitted on the generator "
         "`drooping`, but the search for the likeliest tree was designed looking at its scans of "
-        "other seeds, and at both scans of puu. So neither is unseen. The first nine rows have "
-        "seed 6511, at which nobody looked before, and are of the last code. The others are older "
-        "than the change of the score by which a scan says whether axes show points by their area "
-        "or by their length. PyTLidar (TreeQSM in Python) and PC-skeletor get the same clouds, "
+        "other seeds, and at both scans of puu. So neither is unseen. Each row says its seed and "
+        "its commit: those of an earlier commit are of an earlier search. PyTLidar (TreeQSM in Python) and PC-skeletor get the same clouds, "
         "turned so that the true root is the lowest; Limber finds its root. Lengths, volumes and "
         "radii are medians, over the truth. The rows of the programs side by side are older than "
         "the others: Limber then took fewer proposals.")),

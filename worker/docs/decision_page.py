@@ -46,7 +46,7 @@ PULLS = (
 )
 PATHS = (
     ("a goal for the tip or the grasp", "{goals} planned; unreachable goals refused {hopeless}"),
-    ("the gentlest path", "{saved} less energy than RRT* on the paper's branches, {longer} longer; "
+    ("the gentlest path", "{saved} less energy than RRT* on arcs of the paper's size, {longer} longer; "
      "proven to be within {gap} of the best (median)"),
     ("a limit of force or strain", "false proofs near the limit: {false proofs}"),
     ("a UR arm (UR3 to UR30, CB3 and e-Series)", "the virtual controller only; faults that ended "

@@ -121,7 +121,7 @@ ROWS = (
      "exact data, worst error: {exact}",
      "`tests/estimation`; `scripts/bench estimation`, `truth`"),
     ("the gentlest path with a proven lower bound; limits that hold on the full model",
-     "on the paper's three branches {saved} less energy than RRT*, {longer} longer (the paper: "
+     "on arcs of the paper's size {saved} less energy than RRT*, {longer} longer (the paper: "
      "35.69 %, 8.10 %)", "`tests/planning`; `scripts/bench planning`"),
     ("recording and execution with a UR arm, under a guard", "on the virtual robot only",
      "`tests/robot` with the real client library; `scripts/bench robot`"),
