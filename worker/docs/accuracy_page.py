@@ -30,7 +30,8 @@ CHAPTERS = {
         "scans that are as sparse, or thinned. No constant was fitted on the generator "
         "`drooping`, but the search for the likeliest tree was designed looking at its scans of "
         "other seeds, and at both scans of puu. So neither is unseen. Each row says its seed and "
-        "its commit: those of an earlier commit are of an earlier search. PyTLidar (TreeQSM in Python) and PC-skeletor get the same clouds, "
+        "its commit: those of an earlier commit are of an earlier search. PyTLidar (TreeQSM "
+        "in Python) and PC-skeletor get the same clouds, "
         "turned so that the true root is the lowest; Limber finds its root. Lengths, volumes and "
         "radii are medians, over the truth. The rows of the programs side by side are older than "
         "the others: Limber then took fewer proposals.")),

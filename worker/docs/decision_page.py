@@ -46,8 +46,8 @@ PULLS = (
 )
 PATHS = (
     ("a goal for the tip or the grasp", "{goals} planned; unreachable goals refused {hopeless}"),
-    ("the gentlest path", "{saved} less energy than RRT* on arcs of the paper's size, {longer} longer; "
-     "proven to be within {gap} of the best (median)"),
+    ("the gentlest path", "{saved} less energy than RRT* on arcs of the paper's size, {longer} "
+     "longer; proven to be within {gap} of the best (median)"),
     ("a limit of force or strain", "false proofs near the limit: {false proofs}"),
     ("a UR arm (UR3 to UR30, CB3 and e-Series)", "the virtual controller only; faults that ended "
      "in a standstill with a report: {faults}"),

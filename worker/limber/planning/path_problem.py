@@ -122,8 +122,8 @@ def no_path_error(problem: GentleProblem, proof: str) -> BlockedError:
     """Return the error for a goal that no path reaches, with the ``proof``."""
     counted = _in_words(problem, problem.sure_limits)
     if counted:
-        proof += (" The proof includes the largest cross-validation error of the energy field: no "
-                  f"path exists with{counted} on the field either.")
+        proof += (" The proof includes the largest cross-validation error of the energy field: on "
+                  f"the field no path keeps{counted} together either.")
     return BlockedError("No path exists in the sampled region: no path "
                         f"with{problem.limits_in_words() or ' accepted poses'} leads from the "
                         "start to the goal.", proof, "Raise the limit, choose another goal, or "

@@ -712,8 +712,8 @@ def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: St
             titles[at[name]], ANGLE_UNITS_RAD, "rad", path) for name in angles}, path)
     else:
         warnings.append(Text("The robot's table has no rotation, so the gripper is assumed not to "
-                             "rotate. This is correct for a point grasp (",
-                             Option("grasp_mode", "point"), ")."))
+                             "rotate. With a point grasp (", Option("grasp_mode", "point"),
+                             ") that changes nothing."))
         turns = np.zeros((len(stream), 3))
     values |= dict(zip(POSE_COLUMNS[3:], turns.T, strict=True))
 

@@ -85,7 +85,7 @@ def _swept(skeleton: Skeleton, settings: MeshSettings) -> MeshResult:
     swept = sweep_tree(skeleton, spacing=settings.mesh_spacing)
     warnings = []
     if swept.left_out:
-        warnings.append(f"{len(swept.left_out)} twigs could not be joined to the mesh. Their "
+        warnings.append(f"{len(swept.left_out)} twig(s) could not be joined to the mesh. Their "
                         "mass is kept.")
     return MeshResult(swept.mesh.quadratic(), "sweep", warnings, swept.left_out)
 
