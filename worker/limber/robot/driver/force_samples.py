@@ -132,7 +132,7 @@ class UnderWay:
         elif decision.verdict == Verdict.PAUSE and self.following is not None and decision.limit:
             # Before the brake, as with a stop. A held target is ahead of the arm by the look-ahead:
             # at 50 mm/s the arm would continue into a wall for 3 mm.
-            self._tell(event="paused", reason=str(decision))
+            self._tell(event="paused", reason=str(decision), force_factor=self._guard.force_factor)
             following = self.following
             following.time = max(following.time - self._control.lookahead * following.rate, 0.0)
             following.rate = 0.0
@@ -147,7 +147,7 @@ class UnderWay:
         self._tell(event="stopped", reason=str(decision), moving=True, value=decision.value,
                    limit=decision.limit, command_after_s=latency,
                    clock=sample.clock if sample is not None else None,
-                   at_s=following.time)
+                   at_s=following.time, force_factor=self._guard.force_factor)
         self._stop_arm()
 
     def _stop_arm(self) -> None:

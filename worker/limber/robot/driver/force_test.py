@@ -209,6 +209,14 @@ class ForceTest:
         """The factor of the predicted force, and its standard deviation."""
         return 1.0 + float(self._sums[0][0, 1]), float(np.sqrt(self._variance[1, 1]))
 
+    @property
+    def scale(self) -> tuple[float, float]:
+        """The factor of the predicted force that explains the forces so far if nothing else does,
+        and its standard deviation."""
+        product, square = (float(sums[_SCALE]) for sums in self._sums[1:])
+        square = max(square, 1e-300)
+        return 1.0 + product / square, square**-0.5
+
     def alarm(self, least: float = _ALARM) -> str | None:
         """Return the hypotheses, best first, that explain the forces so far far better than the
         prediction, and the force; None if noise and the known errors explain them, by a logarithm

@@ -47,13 +47,14 @@ def allowed_difference(off: np.ndarray, covariance: np.ndarray, least: float, mo
 
 
 class _Blocks:
-    """Averages forces over blocks, and tests these: of the branch held, or of an empty gripper
-    ``since`` some time after its tare [s]."""
+    """Averages forces over blocks, and tests these: of the branch held, for which ``first`` [N],
+    shape [3], was expected at rest, or of an empty gripper ``since`` some time after its tare [s].
+    """
 
-    def __init__(self, errors: ForceErrors, since: float | None):
-        self._test, self._is_held = ForceTest(errors, since=since or 0.0), since is None
+    def __init__(self, errors: ForceErrors, first: np.ndarray, since: float):
+        self.test, self._first = ForceTest(errors, since=since), first
         self._rows: list[tuple[np.ndarray, ...]] = []
-        self._first = self._last = _NOTHING
+        self._last = _NOTHING
 
     def take(self, sample: Sample, off: np.ndarray, expected: np.ndarray, covariance: np.ndarray,
              places: np.ndarray, base_turn: np.ndarray, count: int, *, is_beyond: bool,
@@ -63,7 +64,7 @@ class _Blocks:
         its bound what explains it best."""
         now = np.r_[sample.pose[:3], sample.clock]
         if not len(self._last):
-            self._first, self._last = expected if self._is_held else np.zeros(3), now
+            self._last = now
         self._rows.append((off, expected - self._first, covariance, places))
         step = now - self._last
         if len(self._rows) < count and not (is_beyond and step[3] > 0.0):
@@ -71,10 +72,10 @@ class _Blocks:
         off, expected, covariance, places = (np.mean(each, axis=0)
                                              for each in zip(*self._rows, strict=True))
         self._last, self._rows = now, []
-        self._test.take(Block(off, expected, covariance, base_turn @ frame_of(sample.pose)[:3, :3],
+        self.test.take(Block(off, expected, covariance, base_turn @ frame_of(sample.pose)[:3, :3],
                               base_turn @ sample.speed[:3], length(step[:3]), float(step[3]),
                               places))
-        return self._test.alarm(-np.inf) if is_beyond else self._test.alarm()
+        return self.test.alarm(-np.inf) if is_beyond else self.test.alarm()
 
 
 class State(Enum):
@@ -223,8 +224,14 @@ class Guard:
         self._held_clock: float | None = None
         self._block_count = int(np.ceil(BLOCK_SECONDS * rate))
         self._forces: _Blocks | None = None
+        self._first: np.ndarray | None = None
         self._tared_clock: float | None = None
         self._set = SteadySettings(arm)
+
+    @property
+    def force_factor(self) -> tuple[float, float] | None:
+        """As :attr:`.ForceTest.scale`, of the motion so far; None without a branch."""
+        return None if self._forces is None else self._forces.test.scale
 
     # Actions of a person
 
@@ -239,7 +246,7 @@ class Guard:
         """The gripper holds the resting branch: from here on its force follows the prediction.
         ``off``, measured minus predicted [N], shape [3], is what the fingers press aside and the
         drift so far, and tells nothing of the branch; None: it holds nothing."""
-        self._held, self._held_clock, self._forces = off, None, None
+        self._held, self._held_clock, self._forces, self._first = off, None, None, None
 
     def begin(self, *, by_joints: bool = False) -> None:
         """Allow a motion; of one ``by_joints`` singularities are no limit. SafetyStop after a stop
@@ -519,7 +526,9 @@ class Guard:
                               within)
         if self._forces is None:
             since = sample.clock - (self._tared_clock or sample.clock) + _TARE_SECONDS
-            self._forces = _Blocks(self.errors, since if self._held is None else None)
+            if self._first is None:
+                self._first = np.zeros(3) if self._held is None else expected[:3]
+            self._forces = _Blocks(self.errors, self._first, since if self._held is None else 0.0)
         held = np.zeros(3) if self._held is None else self._held
         alarm = self._forces.take(
             sample, wrench[:3] - expected[:3] - held, expected[:3], uncertainty[:3, :3],

@@ -359,15 +359,17 @@ class Leg:
     trajectory: Trajectory | None = None
 
 
-def legs_of(cell: Cell, motion: RobotMotion, hold: float) -> list[Leg]:
-    """Return the legs of a motion that waits ``hold`` [s] at the path's end."""
+def legs_of(cell: Cell, motion: RobotMotion, hold: float, begun: Trajectory | None = None,
+            ) -> list[Leg]:
+    """Return the legs of a motion that waits ``hold`` [s] at the path's end; ``begun``: the rest of
+    its path where the branch is held already."""
     grip = cell.tool.grip_seconds
-    moves = {"approach": motion.approach, "path": motion.path, "return": motion.return_path,
-             "leaving": motion.leaving}
+    moves = {"approach": motion.approach, "path": begun or motion.path,
+             "return": motion.return_path, "leaving": motion.leaving}
     stands = {"grasp": grip, "hold": hold, "release": grip}
     names = ("approach", "grasp", "path", "hold", "return", "release", "leaving")
     return [Leg(name, moves[name].duration, moves[name]) if name in moves
-            else Leg(name, stands[name]) for name in names]
+            else Leg(name, stands[name]) for name in names[0 if begun is None else 2:]]
 
 
 def described(legs: Sequence[Leg], cell: Cell) -> list[dict[str, Any]]:

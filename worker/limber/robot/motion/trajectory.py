@@ -255,6 +255,13 @@ class Trajectory:
                           None if self.expected is None else self.expected.reversed(),
                           None if self.joints is None else self.joints[::-1], self.by_joints)
 
+    def since(self, row: int, times: np.ndarray) -> "Trajectory":
+        """Return it from a ``row`` on at ``times`` [n - row] [s]."""
+        felt = self.expected
+        return Trajectory(times, self.poses[row:], None if felt is None else ExpectedWrench(
+            felt.wrenches[row:], felt.slopes[row:], felt.covariance[row:], felt.rest_pose,
+            felt.places[row:]), None if self.joints is None else self.joints[row:], self.by_joints)
+
     def _segment_at(self, time: float) -> tuple[int, float]:
         time = min(max(time, 0.0), self.duration)
         k = min(int(np.searchsorted(self.times, time, side="right")) - 1, len(self.times) - 2)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import InputError, Option, SafetyStop, Text
+from limber.core.errors import InputError, LimberError, Option, SafetyStop, Text
 from limber.core.files.tables import table_line
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
@@ -33,9 +33,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from limber.cell.cell_file import Cell
+    from limber.planning.constraints.chance import YoungUncertainty
+    from limber.planning.field.grasp_model import GraspModel
     from limber.robot.driver.link import LiveForce, RobotLink
     from limber.robot.motion.execution import Leg, RobotMotion
+    from limber.robot.motion.trajectory import Predicted, Trajectory
     from limber.robot.recorder import PullPlausibility
+    from limber.stages.paths.plan_cell import KeptClear
     from limber.stages.pulls.record_nudge import Nudge
 
 _SPEED, _HOLD_SECONDS = 0.03, 2.0  # m/s, s: of a plan that states none
@@ -107,6 +111,10 @@ class ExecutePlan(BranchStage):
     after_stop: AfterStop = option(
         "What to do after a stop. ask: ask at the terminal, or hold without one.", "ask",
         panel=False)
+    replan: int = option(
+        "Most times that the rest of the path is planned anew from where it was stopped: for the "
+        "soft force limit, or a branch softer or stiffer than estimated. 0: never.", 0,
+        limits={"ge": 0, "le": 20}, panel=False)
     unwatched: bool = option(
         "Follow the path also where its forces are too small for the guard to see an empty "
         "gripper, a slip, a broken branch or a wrong sensor.", False, switch=True, panel=False)
@@ -149,15 +157,23 @@ class ExecutePlan(BranchStage):
 @dataclass(frozen=True)
 class PlannedMotion:
     """What :class:`ExecutePlan` follows: ``asked`` with the plan's own values where none were
-    given, the nudge before the path, None where the arm can make none, and ``result`` as of
-    :meth:`ExecutePlan.run`."""
+    given, ``stated`` by its file; the branch's ``model``, what is ``known`` of its moduli, and the
+    wrenches ``predicted`` with it; ``motion`` and the ``wish`` it was made by; the nudge before the
+    path, None where the arm can make none; ``result`` as of :meth:`ExecutePlan.run`; of a path
+    planned anew ``begun``, its rest from where the branch is held."""
 
     branch: Branch
     cell: Cell
     asked: ExecutePlan
+    stated: dict[str, Any]
+    model: GraspModel
+    known: YoungUncertainty | None
+    predicted: Predicted
+    wish: dict[str, Any]
     motion: RobotMotion
     across: Nudge | None
     result: dict[str, Any]
+    begun: Trajectory | None = None
 
 
 def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) -> PlannedMotion:
@@ -176,14 +192,17 @@ def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) 
         path_nudge,
         planned_poses,
         predicted_along,
-        require_watched,
-        require_within_limits,
     )
-    from limber.stages.paths.plan_cell import KeptClear, legs_in_cell
+    from limber.stages.paths.plan_cell import KeptClear
+    from limber.stages.paths.plan_uncertainty import estimated_uncertainty
     from limber.store.loading import load_grasp_model
 
     progress(0.02, "inverse kinematics")
     model = load_grasp_model(branch, gravity=True, progress=progress)
+    known = estimated_uncertainty(branch, model)
+    if known is None:
+        progress.warn("There is no estimate, so the uncertainty of Young's modulus is unknown. "
+                      "The interval of the predicted force does not include it.")
     clear = KeptClear.of(cell, asked.cell.parent, model, stated.get("clearance_m"))
     # The plan's own rotation of the gripper is the one checked against obstacles.
     rotation = asked.gripper_rotation or (stated.get("robot") or {}).get("gripper_rotation")
@@ -198,17 +217,29 @@ def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) 
         at_once = Predicted.of_forces(planned, np.zeros((len(planned), 3)))
         robot_motion(cell, at_once, model.reach.axis, **wish)
     progress(0.05, "forces along the path")
-    predicted = predicted_along(branch, model, planned[:, :3], stated.get("turning"), clear,
+    predicted = predicted_along(model, known, planned[:, :3], stated.get("turning"), clear,
                                 progress)
     progress(0.4, "inverse kinematics")
     motion = robot_motion(cell, predicted, model.reach.axis, **wish)
     across = path_nudge(branch, model, cell, motion, wish["blocked"], progress)
+    result = checked_motion(cell, asked, predicted, motion, across, clear, progress)
+    return PlannedMotion(branch, cell, asked, stated, model, known, predicted, wish, motion, across,
+                         result)
+
+
+def checked_motion(cell: Cell, asked: ExecutePlan, predicted: Predicted, motion: RobotMotion,
+                   across: Nudge | None, clear: KeptClear, progress: Progress, first: int = 0,
+                   ) -> dict[str, Any]:
+    """Return what is known of a motion for the result. InputError if the predicted poses from the
+    ``first`` on break a limit of the cell, or the guard could not watch the path."""
+    from limber.stages.paths.execute_path import require_watched, require_within_limits
+    from limber.stages.paths.plan_cell import legs_in_cell
+
     result = execution_summary(cell, motion, across) | clear.describe() | {"legs": legs_in_cell(
         cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
         present(asked.hold, "time at the path's end"), progress)}
-    require_within_limits(cell, predicted.poses, predicted.wrenches[:, :3])
-    result["noticed"] = require_watched(cell, motion.path, asked.unwatched, progress.warn)
-    return PlannedMotion(branch, cell, asked, motion, across, result)
+    require_within_limits(cell, predicted.poses[first:], predicted.wrenches[first:, :3])
+    return result | {"noticed": require_watched(cell, motion.path, asked.unwatched, progress.warn)}
 
 
 def _plan_of_cell(asked: ExecutePlan, progress: Progress,
@@ -240,7 +271,8 @@ def _stated_by_plan(branch: Branch, name: str) -> dict[str, Any]:
 
     file = f"plans/{name}.json"
     found = read_plan_summary(branch.path(file)) if branch.has(file) else {}
-    kept = ("robot", "in_motion", "timing", "legs", "turning", "clearance_m")
+    kept = ("robot", "in_motion", "timing", "legs", "turning", "clearance_m", "goal",
+            "limits")
     return {key: found[key] for key in kept if found.get(key) is not None}
 
 
@@ -279,7 +311,7 @@ def _armed(planned: PlannedMotion, progress: Progress) -> dict[str, Any]:
     from limber.stages.paths.execute_path import force_sigma
     from limber.stages.pulls.record_nudge import nudged
 
-    branch, cell, motion, across = planned.branch, planned.cell, planned.motion, planned.across
+    branch, cell, across = planned.branch, planned.cell, planned.across
     asked, name = planned.asked, planned.asked.name
     log = f"executions/{name}/samples.csv"
     with branch.writing(f"the execution of {name}"):
@@ -301,23 +333,23 @@ def _armed(planned: PlannedMotion, progress: Progress) -> dict[str, Any]:
             with live, RobotLink(cell, take) as link:
                 before_path = None if across is None else partial(nudged, link, live, across,
                                                                   judging)
-                event, on_path = _steps(cell, link, motion, asked, batches,
-                                        live, before_path, progress)
+                planned, event, paths = _steps(planned, link, batches, live, before_path, progress)
         finally:
             stream.close()
         for warning in link.warnings:
             progress.warn(warning)
-        samples = np.concatenate(batches)[on_path[0]:on_path[1]] if on_path else None
+        rows = np.concatenate(batches)
         base = matrices(np.array(cell.base.pose))
-        path = (base @ matrices(motion.path.poses))[:, :3, 3]
-        found = (followed(samples, path, force_sigma(cell, samples))
-                 if samples is not None and len(samples) else None)
+        path = (base @ matrices(planned.motion.path.poses))[:, :3, 3]
+        samples = rows[paths[-1]] if paths else rows[:0]
+        found = followed(samples, path, force_sigma(cell, samples)) if len(samples) else None
         reached = event["event"] == "reached"
         result = planned.result | {
             "armed": True, "reached": reached,
             "stop_reason": None if reached else event["reason"],
             "after_stop": event.get("after_stop"),
-            "peak_force_n": found.peak_force if found else None,
+            "peak_force_n": float(np.linalg.norm(
+                rows[paths[0].start:paths[-1].stop, 13:16], axis=1).max()) if found else None,
             "path_error_m": found.path_error if found else None,
             "force_error_of_peak": found.force_error if found else None,
             "force_within_share": found.force_within if found else None}
@@ -334,22 +366,47 @@ def _armed(planned: PlannedMotion, progress: Progress) -> dict[str, Any]:
     return result
 
 
-def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, asked: ExecutePlan,
-           batches: list[np.ndarray], live: LiveForce,
+def _steps(planned: PlannedMotion, link: RobotLink, batches: list[np.ndarray], live: LiveForce,
            before_path: Callable[[], dict[str, Any]] | None, progress: Progress,
-           ) -> tuple[dict[str, Any], tuple[int, int] | None]:
-    """Execute the legs in order, the nudge before the path; end at the first that is stopped."""
-    from limber.robot.motion.execution import legs_of
+           ) -> tuple[PlannedMotion, dict[str, Any], list[slice]]:
+    """Execute the legs in order, the nudge before the path; end at the first that is stopped, if
+    its rest is not planned anew. Returns what was followed last, how that ended, and the samples of
+    each path."""
     from limber.stages.paths.execute_path import require_watched
+    from limber.stages.paths.execute_replan import is_of_modulus, planned_anew
 
-    _open_at_start(cell, link, motion)
+    cell, asked, paths = planned.cell, planned.asked, list[slice]()
+    _open_at_start(cell, link, planned.motion)
     progress(0.5, "taring: keep the gripper free")
     live.at("taring")
     tared = link.tare(_TARE_SECONDS)
-    require_watched(cell, motion.path, asked.unwatched, progress.warn, tared["noise_n"])
-    on_path: tuple[int, int] | None = None
-    event: dict[str, Any] = {}
-    for number, leg in enumerate(legs_of(cell, motion, present(asked.hold, "hold"))):
+    require_watched(cell, planned.motion.path, asked.unwatched, progress.warn, tared["noise_n"])
+    name, event = _legs(planned, link, batches, live, paths, before_path, progress)
+    while (name == "path" and paths and len(paths) <= asked.replan
+           and event["event"] != "reached" and is_of_modulus(event["reason"])):
+        live.at("planning anew")
+        progress.warn(f"The robot was stopped: {event['reason']}. Its path is planned anew "
+                      f"({len(paths)} of at most {asked.replan} times); it holds the branch.")
+        try:
+            planned = planned_anew(planned, event, link, progress.part(0.5, 0.55))
+        except LimberError as error:
+            progress.warn(f"It was not planned anew: {error}")
+            break
+        name, event = _legs(planned, link, batches, live, paths, None, progress)
+    if event["event"] != "reached":
+        event |= {"after_stop": retreat_if_chosen(cell, link, asked.after_stop, progress)}
+    return planned, event, paths
+
+
+def _legs(planned: PlannedMotion, link: RobotLink, batches: list[np.ndarray], live: LiveForce,
+          paths: list[slice], before_path: Callable[[], dict[str, Any]] | None, progress: Progress,
+          ) -> tuple[str, dict[str, Any]]:
+    """Execute the legs in order; return the last one's name, and the event that ended it."""
+    from limber.robot.motion.execution import legs_of
+
+    cell, event = planned.cell, dict[str, Any]()
+    for number, leg in enumerate(legs_of(cell, planned.motion, present(planned.asked.hold, "hold"),
+                                         planned.begun)):
         progress(0.55 + 0.06 * number, leg.name)
         if leg.name == "path" and before_path is not None:
             event = before_path()
@@ -362,12 +419,10 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, asked: ExecutePlan,
         begin = sum(map(len, batches))
         event = link.follow(leg.trajectory)
         if leg.name == "path":
-            on_path = (begin, sum(map(len, batches)))
+            paths.append(slice(begin, sum(map(len, batches))))
         if event["event"] != "reached":
             break
-    if event["event"] != "reached":
-        event |= {"after_stop": retreat_if_chosen(cell, link, asked.after_stop, progress)}
-    return event, on_path
+    return leg.name, event
 
 
 def _stand(cell: Cell, link: RobotLink, leg: Leg, progress: Progress) -> None:

@@ -23,7 +23,6 @@ from limber.robot.driver.force_test import BLOCK_SECONDS, ForceErrors, noticed
 from limber.robot.motion.execution import Blocked, RobotMotion
 from limber.robot.motion.trajectory import Predicted, Trajectory
 from limber.stages.paths.plan_cell import KeptClear
-from limber.stages.paths.plan_uncertainty import estimated_uncertainty
 from limber.stages.pulls.record_nudge import Nudge, checked_nudge
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.stages.pulls.record_prediction import PullModel
@@ -67,18 +66,14 @@ def offsets_along(turning: dict[str, Any] | None, positions: np.ndarray) -> np.n
                             for column in np.array(turning["offsets_rad"]).T])
 
 
-def predicted_along(branch: Branch, model: GraspModel, positions: np.ndarray,
+def predicted_along(model: GraspModel, known: YoungUncertainty | None, positions: np.ndarray,
                     turning: dict[str, Any] | None, clear: KeptClear, progress: Progress,
                     ) -> Predicted:
     """Return the model's prediction from rest to the path's end: the grasp passes the plan's
     ``positions`` [n, 3], rotated as the branch would and by the plan's offset (``turning``), in
     steps so small that straight lines stretch nothing, and the wrench is that of the branch so
     clamped. NoPathError if it comes nearer to an obstacle than ``clear`` allows; WorkError if a
-    pose has no reliable solution."""
-    uncertainty = estimated_uncertainty(branch, model)
-    if uncertainty is None:
-        progress.warn("There is no estimate, so the uncertainty of Young's modulus is unknown. "
-                      "The interval of the predicted force does not include it.")
+    pose has no reliable solution. ``known``: of the moduli, if anything is."""
     positions = _closely(positions)
     offsets = offsets_along(turning, positions)
     clamped = Grasp.gripping(model.mesh, model.grasp.centre, GRASP_RADIUS_M)
@@ -105,8 +100,8 @@ def predicted_along(branch: Branch, model: GraspModel, positions: np.ndarray,
         poses.append(pose)
         wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
         stiffness.append(grasp_slopes(firm, clamped, held).wrench)
-        covariances.append(np.zeros((3, 3)) if uncertainty is None
-                           else _by_young(firm, clamped, result, uncertainty))
+        covariances.append(np.zeros((3, 3)) if known is None
+                           else _by_young(firm, clamped, result, known))
         progress(0.05 + 0.35 * number / len(positions), "forces along the path")
     return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
                      np.array(covariances))

@@ -308,7 +308,7 @@ class PlanPaths(PlanSettings, Repeatable, PlacedStage):
                              "Give ", Option("cell"), ", or omit ", Option("turn_slack"), ".")
         in_cell = None
         if self.cell is not None:
-            in_cell = _InCell.of(branch, self.cell, asked, progress, self, grasp_model)
+            in_cell = InCell.of(branch, self.cell, asked, progress, self, grasp_model)
             digests = digests | {"cell": file_digest(self.cell)}
         earlier = branch.manifest.stages.get(key)
         finished = earlier is not None and not earlier.result.get("stopped")
@@ -376,7 +376,7 @@ class PlanPaths(PlanSettings, Repeatable, PlacedStage):
 
 
 @dataclass(frozen=True)
-class _InCell:
+class InCell:
     """A cell, and its limits."""
 
     cell: Cell
@@ -387,7 +387,7 @@ class _InCell:
 
     @classmethod
     def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress,
-           settings: PlanSettings, grasp_model: GraspModel) -> _InCell:
+           settings: PlanSettings, grasp_model: GraspModel) -> InCell:
         from limber.cell.obstacles import cell_obstacles
         from limber.cell.reach_and_collision import clearance_in
         from limber.robot.depth_camera import look
