@@ -543,7 +543,7 @@ def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
         try:
             found[name] = plan_path(asked, search, engine=engine, progress=part)
         except NoPathError:
-            progress.warn(f"{name} found no path. The eikonal planner finds one, or says why not.")
+            progress.warn(f"{name} found no path. The search goes on without it.")
     return found
 
 

@@ -124,7 +124,7 @@ class Batch(Tool):
             names = ", ".join(name for name, _stage, _why in failed[:_NAMED]) + (
                 f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else "")
             raise WorkError(f"{len(failed)} of {len(jobs.branches)} branches failed: {names}; "
-                            f"{': '.join(failed[0])}", "The others are done.", "See "
+                            f"{': '.join(failed[0])}", "The others are done." * (len(failed) < len(jobs.branches)), "See "
                             f"{path_of_page(jobs)}, correct the cause, and run this with ",
                             Option("retry_failed", True), ".")
         return {"branch_count": len(jobs.branches), **counts(jobs, records),

@@ -38,7 +38,7 @@ class NewCell(Tool):
     address: str | None = given("Address of its controller.")
     sensor: Literal["controller", "ft300", "ft300_usb", "none"] | None = given(
         "Force-torque sensor. Default: the arm's own, where it has one.")
-    gripper: Literal["none", "digital_output", "robotiq", "by_hand"] | None = given(
+    gripper: Literal["none", "digital_output", "robotiq", "ros", "by_hand"] | None = given(
         "How the gripper is moved.")
     mass_kg: float | None = given("Mass of the gripper with the sensor [kg].")
     grasp_distance: float | None = given("Distance from the flange to the middle of the fingers "
