@@ -48,6 +48,7 @@ PATHS = (
     ("a goal for the tip or the grasp", "{goals} planned; unreachable goals refused {hopeless}"),
     ("the gentlest path", "{saved} less energy than RRT* on arcs of the paper's size, {longer} "
      "longer; proven to be within {gap} of the best (median)"),
+    ("E I that is off", "forces and energies are off by as much; shape and strain follow the pose"),
     ("a limit of force or strain", "false proofs near the limit: {false proofs}"),
     ("a UR arm (UR3 to UR30, CB3 and e-Series)", "the virtual controller only; faults that ended "
      "in a standstill with a report: {faults}"),
@@ -57,6 +58,8 @@ NEVER = (
     "a real robot of any make", "Windows and macOS, outside the build of wheels",
     "the modulus of a plant against a laboratory test",
     "leaves in the wind: the drag is that of bare wood",
+    "a phone's scan of a plant with known radii ([scan by a phone](../howto/phone.md))",
+    "the modulus through a scan of under 1,500 points",
 )
 
 
