@@ -123,9 +123,9 @@ class Batch(Tool):
         if failed:
             names = ", ".join(name for name, _stage, _why in failed[:_NAMED]) + (
                 f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else "")
+            others = "The others are done." if len(failed) < len(jobs.branches) else ""
             raise WorkError(f"{len(failed)} of {len(jobs.branches)} branches failed: {names}; "
-                            f"{': '.join(failed[0])}", "The others are done." * (len(failed) < len(jobs.branches)), "See "
-                            f"{path_of_page(jobs)}, correct the cause, and run this with ",
-                            Option("retry_failed", True), ".")
+                            f"{': '.join(failed[0])}", others, f"See {path_of_page(jobs)}, correct "
+                            "the cause, and run this with ", Option("retry_failed", True), ".")
         return {"branch_count": len(jobs.branches), **counts(jobs, records),
                 "table": path_of_table(jobs), "page": path_of_page(jobs)}
