@@ -195,7 +195,7 @@ def test_stopped_while_the_bound_closes_the_best_so_far_is_kept(copied, monkeypa
     """Checked on the full model as any other; the next run is made, not taken for done. A finished
     plan of the name stays."""
     def interrupt(_fraction, message, numbers):
-        if message == "bounding the best path" and numbers["upper"] < np.inf:
+        if message == "bounding the best path" and numbers.get("upper", np.inf) < np.inf:
             raise KeyboardInterrupt
 
     settings = PlanSpec(iterations=100)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -20,7 +19,6 @@ from limber.core.settings import Groups
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.stages.paths.execute_summary import (
     arm_line,
-    execution_summary,
     noticed_lines,
     outcome_line,
     write_preview,
@@ -33,14 +31,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from limber.cell.cell_file import Cell
-    from limber.planning.constraints.chance import YoungUncertainty
-    from limber.planning.field.grasp_model import GraspModel
     from limber.robot.driver.link import LiveForce, RobotLink
     from limber.robot.motion.execution import Leg, RobotMotion
-    from limber.robot.motion.trajectory import Predicted, Trajectory
     from limber.robot.recorder import PullPlausibility
-    from limber.stages.paths.plan_cell import KeptClear
-    from limber.stages.pulls.record_nudge import Nudge
+    from limber.stages.paths.execute_path import PlannedMotion
 
 _SPEED, _HOLD_SECONDS = 0.03, 2.0  # m/s, s: of a plan that states none
 _TARE_SECONDS = 1.0
@@ -154,28 +148,6 @@ class ExecutePlan(BranchStage):
         return _armed(planned, progress)
 
 
-@dataclass(frozen=True)
-class PlannedMotion:
-    """What :class:`ExecutePlan` follows: ``asked`` with the plan's own values where none were
-    given, ``stated`` by its file; the branch's ``model``, what is ``known`` of its moduli, and the
-    wrenches ``predicted`` with it; ``motion`` and the ``wish`` it was made by; the nudge before the
-    path, None where the arm can make none; ``result`` as of :meth:`ExecutePlan.run`; of a path
-    planned anew ``begun``, its rest from where the branch is held."""
-
-    branch: Branch
-    cell: Cell
-    asked: ExecutePlan
-    stated: dict[str, Any]
-    model: GraspModel
-    known: YoungUncertainty | None
-    predicted: Predicted
-    wish: dict[str, Any]
-    motion: RobotMotion
-    across: Nudge | None
-    result: dict[str, Any]
-    begun: Trajectory | None = None
-
-
 def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) -> PlannedMotion:
     """Return the checked motion of a plan; InputError, NoPathError as of
     :meth:`ExecutePlan.run`."""
@@ -188,6 +160,8 @@ def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) 
     from limber.robot.motion.execution import robot_motion, turned
     from limber.robot.motion.trajectory import Predicted
     from limber.stages.paths.execute_path import (
+        PlannedMotion,
+        checked_motion,
         offsets_along,
         path_nudge,
         planned_poses,
@@ -225,21 +199,6 @@ def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) 
     result = checked_motion(cell, asked, predicted, motion, across, clear, progress)
     return PlannedMotion(branch, cell, asked, stated, model, known, predicted, wish, motion, across,
                          result)
-
-
-def checked_motion(cell: Cell, asked: ExecutePlan, predicted: Predicted, motion: RobotMotion,
-                   across: Nudge | None, clear: KeptClear, progress: Progress, first: int = 0,
-                   ) -> dict[str, Any]:
-    """Return what is known of a motion for the result. InputError if the predicted poses from the
-    ``first`` on break a limit of the cell, or the guard could not watch the path."""
-    from limber.stages.paths.execute_path import require_watched, require_within_limits
-    from limber.stages.paths.plan_cell import legs_in_cell
-
-    result = execution_summary(cell, motion, across) | clear.describe() | {"legs": legs_in_cell(
-        cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
-        present(asked.hold, "time at the path's end"), progress)}
-    require_within_limits(cell, predicted.poses[first:], predicted.wrenches[first:, :3])
-    return result | {"noticed": require_watched(cell, motion.path, asked.unwatched, progress.warn)}
 
 
 def _plan_of_cell(asked: ExecutePlan, progress: Progress,

@@ -1,8 +1,9 @@
 """The path that a plan is executed along: its poses, and the branch's forces solved again there."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import Akima1DInterpolator
@@ -10,6 +11,7 @@ from scipy.interpolate import Akima1DInterpolator
 from limber.cell.cell_file import Cell
 from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.files.tables import csv_records, read_columns
+from limber.core.not_none import present
 from limber.core.numerics.rigid import composed, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.mechanics import BranchModel, Grasp, StaticResult, follow_poses
@@ -22,17 +24,43 @@ from limber.robot.driver.force_samples import INDEPENDENT_READINGS
 from limber.robot.driver.force_test import BLOCK_SECONDS, ForceErrors, noticed
 from limber.robot.motion.execution import Blocked, RobotMotion
 from limber.robot.motion.trajectory import Predicted, Trajectory
-from limber.stages.paths.plan_cell import KeptClear
+from limber.stages.paths.execute_summary import execution_summary
+from limber.stages.paths.plan_cell import KeptClear, legs_in_cell
 from limber.stages.pulls.record_nudge import Nudge, checked_nudge
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
 from limber.store.loading import stiffness_deviation
 
+if TYPE_CHECKING:
+    from limber.stages.paths.execute import ExecutePlan
+
 _SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
 # a branch by 3 micrometres
 _MOST_POSES = 120
 _BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
+
+
+@dataclass(frozen=True)
+class PlannedMotion:
+    """What :class:`.ExecutePlan` follows: ``asked`` with the plan's own values where none were
+    given, ``stated`` by its file; the branch's ``model``, what is ``known`` of its moduli, and the
+    wrenches ``predicted`` with it; ``motion`` and the ``wish`` it was made by; the nudge before the
+    path, None where the arm can make none; ``result`` as of :meth:`.ExecutePlan.run`; of a path
+    planned anew ``begun``, its rest from where the branch is held."""
+
+    branch: Branch
+    cell: Cell
+    asked: "ExecutePlan"
+    stated: dict[str, Any]
+    model: GraspModel
+    known: YoungUncertainty | None
+    predicted: Predicted
+    wish: dict[str, Any]
+    motion: RobotMotion
+    across: Nudge | None
+    result: dict[str, Any]
+    begun: Trajectory | None = None
 
 
 def planned_poses(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
@@ -189,3 +217,15 @@ def _closely(positions: np.ndarray) -> np.ndarray:
         np.linspace(a, b, max(int(np.ceil((b - a) / spacing)), 1) + 1)[:-1]
         for a, b in pairwise(places)] + [places[-1:]])
     return Akima1DInterpolator(places, positions, method="makima")(stations)
+
+
+def checked_motion(cell: Cell, asked: "ExecutePlan", predicted: Predicted, motion: RobotMotion,
+                   across: Nudge | None, clear: KeptClear, progress: Progress, first: int = 0,
+                   ) -> dict[str, Any]:
+    """Return what is known of a motion for the result. InputError if the predicted poses from the
+    ``first`` on break a limit of the cell, or the guard could not watch the path."""
+    result = execution_summary(cell, motion, across) | clear.describe() | {"legs": legs_in_cell(
+        cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
+        present(asked.hold, "time at the path's end"), progress)}
+    require_within_limits(cell, predicted.poses[first:], predicted.wrenches[first:, :3])
+    return result | {"noticed": require_watched(cell, motion.path, asked.unwatched, progress.warn)}

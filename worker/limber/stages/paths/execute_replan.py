@@ -22,8 +22,7 @@ from limber.robot.driver.link import RobotLink
 from limber.robot.motion.execution import robot_motion
 from limber.robot.motion.retreat import JOINT_RAD
 from limber.robot.motion.trajectory import along, speed_within
-from limber.stages.paths.execute import PlannedMotion, checked_motion
-from limber.stages.paths.execute_path import predicted_along
+from limber.stages.paths.execute_path import PlannedMotion, checked_motion, predicted_along
 from limber.stages.paths.plan import InCell
 from limber.stages.paths.plan_cell import KeptClear
 
