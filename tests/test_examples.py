@@ -94,7 +94,7 @@ def test_the_paper_section_by_section(tmp_path):
     with patch.object(sys, "argv", asked):
         told = run_here(code, tmp_path)
         assert run_here(code, tmp_path) == told
-    row, = re.findall(r"^artificial +(.+\))$", told, re.MULTILINE)
+    row, _ = re.findall(r"^artificial +(.+\))$", told, re.MULTILINE)
     each = re.findall(r"(\S+) \((\S+) to (\S+); (\S+)\)", row)
     assert len(each) == 4
     assert all(float(low) < float(true) < float(high) for _, low, high, true in each)
