@@ -14,8 +14,16 @@ from limber.cell.obstacles import Box
 from limber.core.errors import NoPathError
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.stored_states import States
-from limber.planning.goals.goal import Ball, CellPlace, GoalRequest, goal_points, with_near_side
-from limber.planning.goals.goal_kinds import CellGoal, TargetGoal, goal_of
+from limber.planning.goals.goal import (
+    TIP,
+    CellPlace,
+    Goal,
+    GoalRequest,
+    goal_points,
+    with_near_side,
+)
+from limber.planning.goals.goal_kinds import CellGoal, goal_of
+from limber.planning.goals.region import Ball
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSpec
 from limber.stages.paths.plan_cell import cell_positions, hiding
@@ -46,7 +54,8 @@ def side_goal(field, small_model, blocked=left_half):
     middle = tuple(field.tip(field.rest[None])[0])
     place = CellPlace(Ball(middle, 0.5), blocked, False, "arm's length", "Nobody takes {what}",
                       "Move the wall")
-    return CellGoal(place.region, advice=place.advice, cell_place=place, grasp_model=small_model)
+    return CellGoal(TIP, place.region, advice=place.advice, cell_place=place,
+                    grasp_model=small_model)
 
 
 @pytest.mark.slow
@@ -55,15 +64,14 @@ def test_a_region_of_which_half_does_has_its_border_there(field, small_model):
     proven; a place that does nowhere is refused with its reason."""
     goal = side_goal(field, small_model).learnt(field)
     points = field.region.draw(1000, np.random.default_rng(5))
-    inside = goal.distance(field, points) <= goal.tolerance
+    inside = goal.excess(field, points) <= 0.0
     y = field.tip(points)[:, 1]
     assert inside[y < -0.03].mean() > 0.95 and inside[y > 0.0].mean() < 0.02
     assert (goal.uncertainty(field, points) == np.inf).all()
     reached = goal_points(goal, field, field.limited())
     assert len(reached) == 200 and field.tip(reached)[:, 1].max() < 0.015
     everywhere = side_goal(field, small_model, lambda *_: "").learnt(field)
-    assert np.array_equal(everywhere.distance(field, points),
-                          TargetGoal.distance(everywhere, field, points))
+    assert np.array_equal(everywhere.excess(field, points), Goal.excess(everywhere, field, points))
     stated = everywhere.uncertainty(field, points)
     assert 0.0 < stated.min() < stated.max() <= field.position_error()
     with pytest.raises(NoPathError) as refused:
@@ -132,8 +140,8 @@ def test_a_plan_ends_deeper_in_a_region_than_the_field_is_wrong(field):
     tips = field.tip(field.region.draw(4000, np.random.default_rng(3)))
     rest = field.tip(field.rest[None])[0]
     away = np.linalg.norm(tips - rest, axis=1)
-    goal = TargetGoal(Ball(tuple(tips[np.argmin(np.abs(away - 0.08))]), 0.03))
-    assert goal.distance(field, field.rest[None])[0] > goal.tolerance
+    goal = Goal(TIP, Ball(tuple(tips[np.argmin(np.abs(away - 0.08))]), 0.03))
+    assert goal.excess(field, field.rest[None])[0] > 0.0
     start = field.rest
     inner = goal.with_margin(field, field.limited(), start)
     points = goal_points(inner, field, field.limited())
@@ -144,10 +152,10 @@ def test_a_plan_ends_deeper_in_a_region_than_the_field_is_wrong(field):
     assert (inner.uncertainty(field, points) > goal.uncertainty(field, points)).all()
     # A ball that the tip only touches: nothing is left of it with the whole margin.
     far = tips[np.argmax(tips[:, 0])]
-    touched = TargetGoal(Ball(tuple(far + [0.2998, 0.0, 0.0]), 0.3))
+    touched = Goal(TIP, Ball(tuple(far + [0.2998, 0.0, 0.0]), 0.3))
     assert touched.with_margin(field, field.limited(), start).margin < 1.0
     # A start that is in the goal stays where it is.
-    around = TargetGoal(Ball(tuple(rest), 0.03))
+    around = Goal(TIP, Ball(tuple(rest), 0.03))
     assert around.with_margin(field, field.limited(), start) is around
 
 
@@ -164,10 +172,10 @@ def test_states_of_a_plan_refine_the_border(field, small_model):
     assert len(goal.drawn_in(wrong).refused) > len(goal.refused)
     assert len(goal.drawn_in(right).taken) == len(goal.taken) + 1
     points = field.region.draw(1000, np.random.default_rng(5))
-    closer = goal.drawn_in(wrong).distance(field, points) <= goal.tolerance
-    known = replace(goal.drawn_in(wrong), caution=1.0).distance(field, points) <= goal.tolerance
+    closer = goal.drawn_in(wrong).excess(field, points) <= 0.0
+    known = replace(goal.drawn_in(wrong), caution=1.0).excess(field, points) <= 0.0
     assert 0 < closer.sum() < known.sum() and (known | ~closer).all(), "ends nearer to what does"
-    assert goal.drawn_in(wrong).distance(field, wrong.poses[:, :3])[0] > goal.tolerance
+    assert goal.drawn_in(wrong).excess(field, wrong.poses[:, :3])[0] > 0.0
     with pytest.raises(NoPathError, match=r"Nobody takes the tip at the end of the path: a wall"):
         goal.require_end(small_model, wrong)
 
@@ -181,11 +189,11 @@ def test_large_goals_are_aimed_at_from_the_near_side(field, small_model):
     points = with_near_side(drawn, start, goal, field, field.limited())
     near = points[len(drawn):]
     assert len(near) > 20
-    assert np.allclose(goal.distance(field, near), goal.tolerance, atol=1e-6)
+    assert np.allclose(goal.excess(field, near), 0.0, atol=1e-6)
     away = np.linalg.norm(points - start, axis=1)
     assert away[len(drawn):].min() < away[:len(drawn)].min()
     everywhere = field.region.draw(4000, np.random.default_rng(2))
-    inside = everywhere[goal.distance(field, everywhere) <= goal.tolerance]
+    inside = everywhere[goal.excess(field, everywhere) <= 0.0]
     assert away.min() <= 1.02 * np.linalg.norm(inside - start, axis=1).min()
 
 
@@ -193,13 +201,13 @@ def test_a_region_that_no_draw_comes_near_is_found_from_the_samples(field, small
                                                                     monkeypatch):
     """The tip of a state of the full model is reachable, however small the region about it; into
     one beside it the branch model leads."""
-    monkeypatch.setattr(TargetGoal, "_walked", lambda self, field, points, generator: points)
+    monkeypatch.setattr(Goal, "_walked", lambda self, field, points, generator: points)
     inner = field.samples.positions[field.region.contains(field.samples.positions)]
     tip = field.tip(inner[[5]])[0]
-    goal = TargetGoal(Ball(tuple(map(float, tip)), 1e-5))
+    goal = Goal(TIP, Ball(tuple(map(float, tip)), 1e-5))
     assert np.allclose(goal_points(goal, field, field.limited(), count=20), inner[5], atol=1e-3)
     assert np.linalg.norm(goal.centre(field) - inner[5]) < 1e-3
-    beside = TargetGoal(Ball(tuple(tip + [0.004, 0.0, 0.0]), 5e-4))
+    beside = Goal(TIP, Ball(tuple(tip + [0.004, 0.0, 0.0]), 5e-4))
     assert beside.missed_by(beside.grown(field, small_model).samples) <= 0.0
 
 
@@ -210,9 +218,9 @@ def test_walking_into_a_large_region_stays_among_the_samples(field):
     far = tips[np.argsort(np.linalg.norm(tips - rest, axis=1))[400]]
     outward = (far - rest) / np.linalg.norm(far - rest)
     for radius in (0.005, 0.05, 1.0):
-        goal = TargetGoal(Ball(tuple(far + (radius - 0.004) * outward), radius))
+        goal = Goal(TIP, Ball(tuple(far + (radius - 0.004) * outward), radius))
         points = goal.guess(field, 100, np.random.default_rng(0))
-        reached = points[goal.distance(field, points) <= goal.tolerance]
+        reached = points[goal.excess(field, points) <= 0.0]
         assert field.region.contains(reached).sum() > 20
 
 

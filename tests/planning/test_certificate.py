@@ -14,8 +14,8 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, arc_lengths, path_cost, resample
 from limber.planning.field.energy_field import knowing
 from limber.planning.field.valid_region import TrustRegion
-from limber.planning.goals.goal import Ball
-from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
+from limber.planning.goals.goal import GRASP, TIP, Goal, grasp_goal
+from limber.planning.goals.region import Ball
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.refine import (
@@ -28,7 +28,7 @@ from limber.planning.planners.refine import (
 from limber.planning.settings import PlanSpec
 
 START = np.array([-0.06, -0.03, 0.02])
-GOAL = GraspGoal((0.1, 0.06, 0.02), 0.01)
+GOAL = grasp_goal((0.1, 0.06, 0.02), 0.01)
 
 
 def problem_on(field, *, start=START, goal=GOAL, deformation=1.0, **limits):
@@ -175,7 +175,7 @@ def test_without_deformation_the_bound_is_the_distance(well_field):
     """Length alone: the best cost is the straight distance to the goal's face."""
     problem = problem_on(well_field, deformation=0.0)
     found = plan_gentle(problem)
-    line = np.linalg.norm(np.array(GOAL.position) - START)
+    line = np.linalg.norm(GOAL.region.middle - START)
     best = 1.5 * (line - GOAL.tolerance) / line
     assert found.certificate.lower <= best * (1 + 1e-9)
     assert found.certificate.lower == pytest.approx(best, rel=0.01)
@@ -185,9 +185,9 @@ def test_without_deformation_the_bound_is_the_distance(well_field):
 @pytest.mark.slow
 def test_from_the_rest_pose_and_for_the_tip(ridge_field):
     """A bound holds for a goal of the tip too, and is close."""
-    wanted = ridge_field.tip(np.array([GOAL.position]))[0]
+    wanted = ridge_field.tip(GOAL.region.middle[None])[0]
     problem = problem_on(ridge_field, start=ridge_field.rest.copy(),
-                         goal=TargetGoal(Ball(tuple(wanted), 0.015)))
+                         goal=Goal(TIP, Ball(tuple(wanted), 0.015)))
     found = plan_gentle(problem, enough=0.05)
     best = min(refine(path, problem)[1] for path in bulges(problem, 4))
     assert found.certificate.lower <= min(best, found.cost) * (1 + 1e-9)
@@ -211,7 +211,7 @@ def test_field_error_lowers_the_bound(across):
 @pytest.mark.slow
 def test_no_path_is_proven_where_a_limit_separates(well_field):
     """A wall of refused poses between start and goal: that there is no path is proven, and said."""
-    start, goal = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
+    start, goal = np.array([-0.12, 0.0, 0.0]), grasp_goal((0.12, 0.0, 0.0), 0.01)
     accepted = well_field.samples.positions
     accepted = accepted[np.abs(accepted[:, 0]) > 0.05]
     walled = replace(well_field, region=TrustRegion.of(accepted, _wall()))
@@ -264,8 +264,8 @@ def test_one_refinement_brings_the_end_to_the_goals_face(well_field):
     """From the straight line to the goal's middle: the minimiser's first step must not be so long
     that it gives up."""
     problem = problem_on(well_field, deformation=0.0)
-    path, cost = refine(np.linspace(START, GOAL.position, 40), problem)
-    line = np.linalg.norm(np.array(GOAL.position) - START)
+    path, cost = refine(np.linspace(START, GOAL.region.centre, 40), problem)
+    line = np.linalg.norm(GOAL.region.middle - START)
     assert cost == pytest.approx(1.5 * (line - GOAL.tolerance) / line, rel=0.001)
     assert -1e-4 < problem.goal_excess(path[-1]) <= 0.0
 
@@ -299,7 +299,7 @@ def test_a_path_far_over_a_limit_is_given_up_soon(ridge_field, monkeypatch):
     monkeypatch.setattr(refine_module._Line, "settle", lambda *given: (
         rounds.append(1), settle(*given))[1])
     problem = problem_on(ridge_field, max_force=1e-3)
-    line = np.linspace(START, GOAL.position, 40)
+    line = np.linspace(START, GOAL.region.centre, 40)
     path, cost = refine(line, problem)
     assert cost == np.inf and path is line and len(rounds) <= 3
 
@@ -331,8 +331,8 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
 
 def test_a_path_that_shrinks_to_nothing_is_refined(ridge_field):
     """A start a nanometre before the goal: the path has fewer corners with each round."""
-    goal = GraspGoal((0.1, 0.06, 0.02), 0.01)
-    start = np.array(goal.position) - [goal.tolerance + 1e-9, 0.0, 0.0]
+    goal = grasp_goal((0.1, 0.06, 0.02), 0.01)
+    start = goal.region.middle - [goal.tolerance + 1e-9, 0.0, 0.0]
     problem = problem_on(ridge_field, start=start, goal=goal, max_energy=2.0)
     path, cost = refine(start + np.linspace(0.0, 1.0, 20)[:, None] * [0.005, 0.0, 0.0], problem)
     assert np.isfinite(cost) and np.linalg.norm(path[-1] - path[0]) < 1e-3
@@ -342,7 +342,7 @@ def test_a_bound_is_for_all_of_the_goal_where_paths_end_deeper_in_it(well_field,
     """A plan that keeps off the goal's border is held against paths that end on it: the bound is
     the one of the goal that was requested."""
     monkeypatch.setattr(lower_bound, "_LEVELS", 2)
-    whole = TargetGoal(Ball((0.15, 0.09, 0.33), 0.02))
+    whole = Goal(TIP, Ball((0.15, 0.09, 0.33), 0.02))
     inner = replace(whole, inset=0.01)
     asked, drawn_in, mixed = (problem_on(well_field, goal=goal) for goal in (whole, inner, inner))
     mixed = replace(mixed, asked_goal=whole, weights=asked.weights)
@@ -357,11 +357,11 @@ def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
     """By brute force, on three grids: its cell has all its coefficients, and the spline of the cost
     left is at most what is taken off the bound. The target moves farther than the grasp, at another
     rate at each place."""
-    goal = TargetGoal(Ball((0.15, 0.09, 0.33), 0.02))
+    goal = Goal(TIP, Ball((0.15, 0.09, 0.33), 0.02))
     problem = problem_on(well_field, goal=goal)
     points = goal.guess(well_field, 4000, np.random.default_rng(3))
     points = points[well_field.region.contains(points)
-                    & (goal.distance(well_field, points) <= goal.tolerance)]
+                    & (goal.excess(well_field, points) <= 0.0)]
     assert len(points) > 100
     grid, cell = first_grid(problem)
     for _ in range(3):
@@ -393,22 +393,22 @@ def test_the_slack_counts_the_curvature_beside_the_border():
     assert goal.slack(costs) == pytest.approx(lower_bound.CURVATURE_FACTOR / 8.0)
 
 
-class Jump(GraspGoal):
+class Jump(Goal):
     """A goal whose distance grows six times as fast in a layer far from it as near it."""
 
-    def distance(self, field, points):
-        near = super().distance(field, points)
-        return near * (1.0 + 1.0 / (1.0 + np.exp(-(near - 0.08) / 0.004)))
+    def excess(self, field, points):
+        away = super().excess(field, points) + self.tolerance
+        return away * (1.0 + 1.0 / (1.0 + np.exp(-(away - 0.08) / 0.004))) - self.tolerance
 
 
 def test_where_the_target_moves_fast_far_from_the_goal_nothing_counts_as_near_it(well_field):
     """As at a snap of the branch: cells there were sources of the bound, of hardly any cost."""
-    problem = problem_on(well_field, goal=Jump((0.1, 0.06, 0.02), 0.01))
+    problem = problem_on(well_field, goal=Jump(GRASP, Ball((0.1, 0.06, 0.02), 0.01)))
     grid, cell = first_grid(problem)
     grid, cell = refined(grid, grid.open_cells, grid.about_goal, cell, 0.5)
     rates = lower_bound._terrain(problem, lower_bound._field_on_grid(problem, grid, cell), grid)
     known = grid.points(np.argwhere(about_goal(problem, grid, rates).known) + 0.5)
-    away = np.linalg.norm(known - problem.goal.position, axis=1)
+    away = np.linalg.norm(known - problem.goal.region.centre, axis=1)
     assert 0.01 < away.max() < 0.05
 
 
@@ -503,7 +503,7 @@ def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
     """Within 3 % of the shortest length: kept, dearer than without, and no bulge that is as short
     has less energy than the dual's bound says."""
     problem = problem_on(ridge_field)
-    shortest, _ = refine(np.linspace(START, GOAL.position, 40), replace(
+    shortest, _ = refine(np.linspace(START, GOAL.region.centre, 40), replace(
         problem, weights=problem.weights._replace(energy=0.0)))
     free = plan_gentle(problem)
     held = plan_detour(problem, shortest, 1.03 * arc_lengths(shortest)[-1], [free.points])
@@ -530,18 +530,18 @@ def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
 def test_no_path_short_enough_leaves_the_cells_that_count(well_field):
     """Every point that is reached and left within the length lies in an open cell; far cells are
     closed."""
-    line = np.linalg.norm(np.array(GOAL.position) - START)
+    line = np.linalg.norm(GOAL.region.middle - START)
     problem = replace(problem_on(well_field), longest=1.1 * line)
     grid, cell = first_grid(problem)
     numbers = np.argwhere(grid.open_cells)
     centres = grid.points(numbers + 0.5)
     near = np.zeros(grid.open_cells.shape, bool)
-    near[tuple(numbers.T)] = np.linalg.norm(centres - GOAL.position, axis=1) <= (
+    near[tuple(numbers.T)] = np.linalg.norm(centres - GOAL.region.centre, axis=1) <= (
         GOAL.tolerance + grid.spacing)
     found = lower_bound.short_enough(problem, grid, grid.open_cells, near, cell)
     points = grid.points(numbers + np.random.default_rng(0).uniform(size=numbers.shape))
     through = np.linalg.norm(points - START, axis=1) + np.maximum(
-        np.linalg.norm(points - GOAL.position, axis=1) - GOAL.tolerance, 0.0)
+        np.linalg.norm(points - GOAL.region.centre, axis=1) - GOAL.tolerance, 0.0)
     short = through <= problem.longest
     assert short.sum() > 50 and found[tuple(numbers[short].T)].all()
     assert found.sum() < 0.7 * grid.open_cells.sum()
@@ -551,7 +551,7 @@ def test_no_path_short_enough_leaves_the_cells_that_count(well_field):
 def test_a_length_is_kept_as_a_limit(ridge_field):
     """From the path round the ridge: just as long as allowed, and gentler than the shortest."""
     problem = problem_on(ridge_field)
-    line = np.linspace(START, GOAL.position, 40)
+    line = np.linspace(START, GOAL.region.centre, 40)
     shortest, _ = refine(line, replace(problem, weights=problem.weights._replace(energy=0.0)))
     longest = 1.02 * np.linalg.norm(np.diff(shortest, axis=0), axis=1).sum()
     limited = replace(problem, longest=longest, weights=problem.weights._replace(

@@ -15,8 +15,7 @@ from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.radial import KERNELS, RadialInterpolant
 from limber.planning.field.stored_states import States
-from limber.planning.goals.goal import allowed_points
-from limber.planning.goals.goal_kinds import GraspGoal
+from limber.planning.goals.goal import allowed_points, grasp_goal
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.refine import plan_gentle, refine
 
@@ -49,7 +48,7 @@ def problem_on(field, share):
     """Across the shell, with a limit of a ``share`` of the force that the end needs; the field is
     taken for the branch."""
     ends = field.region.chart.plain.curved(np.array([[-0.08, 0.03, 0.0], [0.06, 0.07, 0.0]]))
-    goal = GraspGoal(tuple(ends[1]), 0.004)
+    goal = grasp_goal(tuple(ends[1]), 0.004)
     weights = CostWeights.between(field, ends[0], ends[1], deformation=1.0, distance=1.5).weights
     limit = share * np.linalg.norm(field.force(ends), axis=1).max()
     limited = field.limited(max_force=limit)
@@ -128,7 +127,7 @@ def test_no_proof_stands_against_a_path(bowing_field):
     """With a force just enough a path exists, and no cells say otherwise; with one too low for the
     goal they do."""
     enough = problem_on(bowing_field, 1.02)
-    line = np.linspace(enough.start, enough.goal.position, 40)
+    line = np.linspace(enough.start, enough.goal.region.centre, 40)
     path, cost = refine(line, enough)
     assert cost == enough.cost(path) < np.inf
     assert not judge(enough).proven

@@ -13,12 +13,12 @@ from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.goals.goal import Ball
-from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
+from limber.planning.goals.goal import TIP, Goal, grasp_goal
+from limber.planning.goals.region import Ball
 from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem
 from limber.planning.settings import PlanSpec
 
-START, GOAL = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
+START, GOAL = np.array([-0.12, 0.0, 0.0]), grasp_goal((0.12, 0.0, 0.0), 0.01)
 LEVEL, RISE, ROUGH = 1.0, 2.0, 0.15
 """Of a load: everywhere, more of it in a layer across the way, and what no fit can score_unused."""
 
@@ -53,7 +53,7 @@ def lowest_in_the_wall(field, name):
 
 
 def problem_on(field, limits, goal=GOAL):
-    weights = CostWeights.between(field, START, np.array(GOAL.position), deformation=1.0,
+    weights = CostWeights.between(field, START, GOAL.region.middle, deformation=1.0,
                                   distance=1.5).weights
     return GentleProblem(field, limits.on(field), weights, START, goal, beyond=limits.beyond(field))
 
@@ -77,7 +77,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
     """With the limit looser by that error, for the full model to decide; and it is said. What is
     proven is tried neither so nor without margins."""
     settings, limits, told, tried = PlanSpec(), Limits(strain=2.4), [], []
-    there = baseline_and_plan.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
+    there = baseline_and_plan.plan_pair(rough_field, START, grasp_goal(START, 0.01), settings)
 
     def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
         tried.append(2.4 - tried_limits.slack.most.sum())
@@ -127,7 +127,7 @@ def test_a_target_may_be_nearer_than_the_field_has_it(rough_field):
     assert 0.002 < off <= rough_field.position_error() < 0.02
     for away, proven in ((0.5 * off, False), (4.0 * off, True)):
         centre = (0.0, 0.0, float(reach[:, 2].max()) + 0.005 + away)
-        problem = problem_on(rough_field, Limits(), TargetGoal(Ball(centre, 0.005)))
+        problem = problem_on(rough_field, Limits(), Goal(TIP, Ball(centre, 0.005)))
         assert judge(problem).proven == proven
 
 

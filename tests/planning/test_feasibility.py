@@ -15,7 +15,8 @@ from limber.planning.cost import CostWeights, resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.stored_states import States
-from limber.planning.goals.goal_kinds import GraspGoal, default_goal
+from limber.planning.goals.goal import grasp_goal
+from limber.planning.goals.goal_kinds import default_goal
 from limber.planning.make_plan import solved_if_undecided
 from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.planners.least_violation import easiest_path
@@ -24,7 +25,7 @@ from limber.planning.settings import PlanSpec
 
 RADIUS = 0.2  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 4e4  # [N/m] along the shell and off it: it yields a two thousandth as easily
-GOAL = GraspGoal((0.06, 0.0, float(np.sqrt(RADIUS**2 - 0.06**2))), 0.004)
+GOAL = grasp_goal((0.06, 0.0, float(np.sqrt(RADIUS**2 - 0.06**2))), 0.004)
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +56,10 @@ def problem_on(field, **limits):
 def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_field):
     """In a valley a twentieth of a millimetre wide, where the goal asks for a force near the limit;
     poses drawn in the goal say of neither that it can be kept."""
-    held = np.linalg.norm(shell_field.force(np.array([GOAL.position])))
+    held = np.linalg.norm(shell_field.force(GOAL.region.middle[None]))
     wide = problem_on(shell_field, max_force=1.05 * held)
     way = judge(wide).path
-    assert way is not None and np.linalg.norm(way[-1] - GOAL.position) <= GOAL.tolerance
+    assert way is not None and np.linalg.norm(way[-1] - GOAL.region.centre) <= GOAL.tolerance
     assert np.linalg.norm(shell_field.force(resample(way, 0.001)), axis=1).max() < 1.1 * held
     found = plan_gentle(wide, enough=1e6)
     assert found.cost == wide.cost(found.points) < np.inf
@@ -74,7 +75,7 @@ def test_a_chord_far_over_a_limit_is_refined_into_the_valley(shell_field, share)
     """From a chord of the shell with many times the force that is allowed: the path keeps the limit
     and is no dearer than from the easiest way."""
     start = shell_field.region.chart.plain.curved(np.array([[-0.03, 0.05, 0.0]]))[0]
-    ends = np.stack([start, GOAL.position])
+    ends = np.stack([start, GOAL.region.centre])
     limit = share * np.linalg.norm(shell_field.force(ends), axis=1).max()
     problem = replace(problem_on(shell_field, max_force=limit), start=start)
     chord = resample(ends, 0.002)
@@ -88,7 +89,7 @@ def test_a_chord_far_over_a_limit_is_refined_into_the_valley(shell_field, share)
 def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
     """Its worst force is less than the straight line's, and no more than a free path's; with a
     limit above it nothing is over."""
-    start, goal = np.array([-0.06, -0.06, 0.0]), GraspGoal((0.1, 0.1, 0.0), 0.01)
+    start, goal = np.array([-0.06, -0.06, 0.0]), grasp_goal((0.1, 0.1, 0.0), 0.01)
     weights = CostWeights.between(ridge_field, start, goal.centre(ridge_field), deformation=1.0,
                                   distance=1.5).weights
     free = plan_gentle(GentleProblem(ridge_field, ridge_field.limited(), weights, start, goal),
@@ -100,7 +101,7 @@ def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
     def worst(points):
         return np.linalg.norm(ridge_field.force(resample(points, 0.001)), axis=1).max() / limit
     assert way.worst < 0.9 * worst(line) and way.worst < 1.03 * worst(free)
-    assert np.linalg.norm(way.points[-1] - goal.position) <= goal.tolerance
+    assert np.linalg.norm(way.points[-1] - goal.region.centre) <= goal.tolerance
 
 
 def test_a_level_is_the_least_at_which_cells_connect(ridge_field):
@@ -119,7 +120,7 @@ def narrow(planned_branch):
     """The small branch's field, a goal on it, and the force that the goal takes."""
     field = EnergyField.read(planned_branch / "energy.npz")
     goal = default_goal(field, 0.01)
-    return field, goal, float(np.linalg.norm(field.force(np.array([goal.position])), axis=1)[0])
+    return field, goal, float(np.linalg.norm(field.force(goal.region.middle[None]), axis=1)[0])
 
 
 def test_poses_are_asked_where_the_fields_error_leaves_it_in_doubt(narrow, small_model):
@@ -152,7 +153,7 @@ def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(
 
     monkeypatch.setattr(planning, "plan_within", excluded)
     warnings = []
-    settings = PlanSpec(goal=goal.position, goal_tolerance=goal.tolerance, iterations=300,
+    settings = PlanSpec(goal=goal.region.centre, goal_tolerance=goal.tolerance, iterations=300,
                             max_force=1.3 * held, inertia=False)
     monkeypatch.setattr(planning, "_REPLANS", 2)
 

@@ -11,14 +11,14 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.radial import LocalError
-from limber.planning.goals.goal import Ball, allowed_points
-from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
+from limber.planning.goals.goal import TIP, Goal, allowed_points, grasp_goal
+from limber.planning.goals.region import Ball
 from limber.planning.make_plan import checked_wall, confirmed, not_confirmed
 from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.plan_file import read_plan
 from limber.planning.planners.least_violation import LeastViolation
 
-AT_REST = GraspGoal((0.0, 0.0, 0.0), 0.01)
+AT_REST = grasp_goal((0.0, 0.0, 0.0), 0.01)
 
 
 def noisy(count, seed):
@@ -62,9 +62,9 @@ def half_rough(well):
 
 def test_cells_close_by_the_error_of_their_place(half_rough):
     """A limit that the largest error anywhere would leave in doubt closes the smooth half."""
-    start, goal = np.array([-0.12, -0.05, 0.0]), GraspGoal((0.12, -0.05, 0.0), 0.01)
+    start, goal = np.array([-0.12, -0.05, 0.0]), grasp_goal((0.12, -0.05, 0.0), 0.01)
     limits = Limits(strain=2.2)
-    weights = CostWeights.between(half_rough, start, np.array(goal.position), deformation=1.0,
+    weights = CostWeights.between(half_rough, start, goal.region.middle, deformation=1.0,
                                   distance=1.5).weights
     problem = GentleProblem(half_rough, limits.on(half_rough), weights, start, goal,
                             beyond=limits.beyond(half_rough), errors=limits.errors(half_rough))
@@ -135,15 +135,15 @@ def test_a_target_out_of_reach_is_confirmed_by_the_full_model(apart, small_model
         np.empty((0, 3)), places[:1])
     tip = field.tip(places[:1])[0]
     off = float(field.place_errors(None, places[:1])[0])
-    away = TargetGoal(Ball(tuple(tip + [0.0, 0.0, 0.02 + 3.0 * off]), 0.01))
+    away = Goal(TIP, Ball(tuple(tip + [0.0, 0.0, 0.02 + 3.0 * off]), 0.01))
     check = checked_wall(field, small_model, Limits(), none, away)
     assert check.bears_out and check.solved == 1
-    inside = TargetGoal(Ball(tuple(tip), 0.01 + 3.0 * off))
+    inside = Goal(TIP, Ball(tuple(tip), 0.01 + 3.0 * off))
     refuted = checked_wall(field, small_model, Limits(), none, inside)
     assert not refuted.bears_out and len(refuted.learnt.poses) == 1
     low = Limits(force=0.3 * forces.min())
     assert checked_wall(field, small_model, low, none, inside).bears_out
-    monkeypatch.setattr(TargetGoal, "uncertainty", lambda self, field, points: np.full(
+    monkeypatch.setattr(Goal, "uncertainty", lambda self, field, points: np.full(
         len(points), -1.0))
     assert not checked_wall(field, small_model, Limits(), none, away).bears_out
 
@@ -178,9 +178,9 @@ def test_a_plan_keeps_off_a_limit_by_the_error_of_the_place(half_rough):
 
 def test_a_proof_tells_where_the_way_is_closed(half_rough):
     """The wall lies between start and goal, and is over the limit there."""
-    start, goal = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
+    start, goal = np.array([-0.12, 0.0, 0.0]), grasp_goal((0.12, 0.0, 0.0), 0.01)
     limits = Limits(strain=1.5)
-    weights = CostWeights.between(half_rough, start, np.array(goal.position), deformation=1.0,
+    weights = CostWeights.between(half_rough, start, goal.region.middle, deformation=1.0,
                                   distance=1.5).weights
     found = judge(GentleProblem(half_rough, limits.on(half_rough), weights, start, goal,
                                 beyond=limits.beyond(half_rough),
@@ -200,7 +200,7 @@ def test_a_limit_that_a_known_path_keeps_is_never_proven_impossible(planned_bran
              "axial_force": np.abs(way.axial_forces)}
     limits = Limits(**{name: (1.0 + 1e-6) * float(peaks[name].max())})
     start, end = way.poses[[0, -1], :3]
-    goal = GraspGoal(tuple(map(float, end)), 0.005)
+    goal = grasp_goal(tuple(map(float, end)), 0.005)
     found = judge(GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
                                 beyond=limits.beyond(field), errors=limits.errors(field)), 40_000)
     assert not found.proven

@@ -17,8 +17,8 @@ from limber.planning import make_plan as planning
 from limber.planning.constraints.limits import Limits, Obstacles
 from limber.planning.constraints.motion_check import MotionCheck, check_motion, learnt
 from limber.planning.field.energy_field import EnergyField, refit
-from limber.planning.goals.goal import Ball
-from limber.planning.goals.goal_kinds import TargetGoal
+from limber.planning.goals.goal import TIP, Goal
+from limber.planning.goals.region import Ball
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSpec
@@ -183,7 +183,7 @@ def test_a_goal_that_a_miss_made_too_small_is_planned_to_without_its_margins(mon
             raise NoPathError("No path.", "", "")
         return "paths"
     monkeypatch.setattr(planning, "plan_within", fails)
-    aim = TargetGoal(Ball((0.0, 0.0, 0.3), 0.05), margin=0.5, inset=0.02)
+    aim = Goal(TIP, Ball((0.0, 0.0, 0.3), 0.05), margin=0.5, inset=0.02)
     rounds = planning._Rounds(*[None] * 8, aim, *[None] * 2, SILENT)
     assert rounds._within_goal(SILENT) == "paths"
     assert tried == [(0.5, 0.02), (0.0, 0.02), (0.0, 0.0)]

@@ -13,7 +13,7 @@ from tests.stages.test_registry import parsed
 
 from limber.core.errors import InputError, NoPathError
 from limber.core.settings import Groups
-from limber.planning.goals.goal import GoalKind
+from limber.planning.goals.goal import GRASP, Goal, GoalKind
 from limber.planning.goals.goal_kinds import KINDS
 from limber.planning.plan_file import read_plan
 from limber.results.scene.animation import _goal as drawn
@@ -30,42 +30,38 @@ class SidePaths(Planned):
 
 
 @dataclass(frozen=True)
-class SideGoal:
-    """The grasp within ``tolerance`` [m] of the plane at ``x`` [m]."""
+class Slab:
+    """The points within ``depth`` [m] of the plane at ``x`` [m]."""
 
     x: float
-    tolerance: float
-    what = "the grasp"
-    where = "to the plane"
-    advice = "Choose another plane"
+    depth: float
+    words = "a slab"
 
-    def distance(self, field, points):
-        return np.abs(np.asarray(points)[:, 0] - self.x)
+    @property
+    def middle(self):
+        return np.array([self.x, 0.0, 0.4])
 
-    def uncertainty(self, field, points):
-        return np.zeros(len(points))
+    def distance(self, points):
+        return np.abs(np.asarray(points)[:, 0] - self.x) - self.depth
+
+
+class SideGoal(Goal):
+    """The grasp in a slab, with its own draws, and a condition on the end."""
 
     def guess(self, field, count, generator):
         drawn = field.region.draw(20 * count, generator)
-        return drawn[self.distance(field, drawn) <= self.tolerance][:count]
+        return drawn[self.excess(field, drawn) <= 0.0][:count]
 
     def centre(self, field):
         points = self.guess(field, 200, np.random.default_rng(0))
         return points[np.argmin(field.energy(points))]
-
-    def missed_by(self, states):
-        return abs(states.poses[-1, 0] - self.x) - self.tolerance
-
-    def drawn_in(self, states):
-        return self
 
     def require_end(self, grasp_model, states):
         if states.energies[-1] > 1.0:
             raise NoPathError("The branch is bent too far there.", "", "")
 
     def describe(self):
-        return {"kind": "side", "x_m": self.x, "position_m": [self.x, 0.0, 0.4],
-                "tolerance_m": self.tolerance}
+        return super().describe() | {"kind": "side", "x_m": self.region.x}
 
     def describe_end(self, states):
         return {"side_end_m": states.poses[-1, 0]}
@@ -74,7 +70,8 @@ class SideGoal:
 @pytest.fixture
 def side():
     """The kind, known while a test runs."""
-    kind = GoalKind("goal_side", lambda asked, x: SideGoal(x, asked.settings.goal_tolerance))
+    kind = GoalKind("goal_side", lambda asked, x: SideGoal(
+        GRASP, Slab(x, asked.settings.goal_tolerance), advice="Choose another plane"))
     KINDS.append(kind)
     yield kind
     KINDS.remove(kind)

@@ -13,7 +13,7 @@ from limber.cell.reach_and_collision import ArmSurroundings, blocked_by, clearan
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import angle_between, pose_vectors
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.planning.goals.goal_kinds import View
+from limber.planning.goals.region import View
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSpec
 from limber.stages.paths.execute import _stated_by_plan

@@ -227,7 +227,7 @@ def test_a_goal_drawn_from_the_papers_hemisphere(copied):
 
     def drawn(seed, **limits):
         goal = hemisphere_goal(field, base, length, field.limited(**limits), 0.01, seed)
-        return np.array(goal.position)
+        return goal.region.middle
 
     first = drawn(1)
     assert np.array_equal(first, drawn(1)) and not np.allclose(first, drawn(2))
@@ -308,7 +308,7 @@ def test_a_wide_bound_is_named():
 def test_tip_goal_puts_the_real_tip_there(copied):
     """With a goal for the tip, the full model's tip ends within the tolerance."""
     field = EnergyField.read(copied / "energy.npz")
-    wanted = field.tip(np.array(default_goal(field, 0.01).position))[0]
+    wanted = field.tip(default_goal(field, 0.01).region.middle)[0]
     done = Planned(branch_folder=copied, tip_goal=tuple(wanted), iterations=300, name="tip").run()
     assert np.linalg.norm(np.array(done["plan"]["tip_end_m"]) - wanted) <= 0.01 * 1.001
 

@@ -9,15 +9,9 @@ from limber.core.errors import InputError
 from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import fit_field
-from limber.planning.goals.goal import Ball, BoxRegion, GoalRequest, goal_points
-from limber.planning.goals.goal_kinds import (
-    TargetGoal,
-    View,
-    default_goal,
-    goal_of,
-    second_arm_goal,
-    tip_goal,
-)
+from limber.planning.goals.goal import TIP, Goal, GoalRequest, Point, goal_points
+from limber.planning.goals.goal_kinds import default_goal, goal_of, second_arm_goal, tip_goal
+from limber.planning.goals.region import Ball, BoxRegion, View
 from limber.planning.path_problem import random_start
 from limber.planning.settings import PlanSpec
 
@@ -65,7 +59,7 @@ def test_a_named_target_is_brought_into_a_box(ridge):
     flower = 2.0 * samples.positions + [0.0, 0.1, 0.2]
     field = fit_field(replace(samples, targets=flower[:, None]))
     box = BoxRegion((0.1, 0.0, 0.1), (0.2, 0.15, 0.3))
-    points = goal_points(TargetGoal(box, 0, "flower"), field, field.limited())
+    points = goal_points(Goal(Point("flower", 0), box), field, field.limited())
     found = 2.0 * points + [0.0, 0.1, 0.2]
     assert len(points) > 20 and box.distance(found).max() < 2e-3
     assert box.distance(1.5 * points + [0.0, 0.0, 0.3]).max() > 0.01
@@ -73,20 +67,20 @@ def test_a_named_target_is_brought_into_a_box(ridge):
 
 def test_a_region_larger_than_what_was_sampled_has_goal_poses(ridge_field):
     """A ball that holds many sampled poses and none deep inside, as a second arm's reach is."""
-    goal = TargetGoal(Ball((0.0, 0.7, 0.3), 0.65))
+    goal = Goal(TIP, Ball((0.0, 0.7, 0.3), 0.65))
     everywhere = ridge_field.region.draw(2000, np.random.default_rng(0))
-    inside = goal.distance(ridge_field, everywhere) <= goal.tolerance
+    inside = goal.excess(ridge_field, everywhere) <= 0.0
     assert 0.3 < inside.mean() < 0.8
     points = goal_points(goal, ridge_field, ridge_field.limited())
     assert len(points) == 200
-    assert goal.distance(ridge_field, points).max() <= goal.tolerance
+    assert goal.excess(ridge_field, points).max() <= 0.0
     assert np.ptp(points, axis=0).min() > 0.5 * np.ptp(everywhere[inside], axis=0).min()
     assert ridge_field.region.contains(goal.centre(ridge_field)[None])[0]
 
 
 def test_a_start_in_the_goal_stays_there(ridge_field):
     """Both paths have no length, and no path costs less."""
-    goal = TargetGoal(Ball((0.0, 0.7, 0.3), 0.65))
+    goal = Goal(TIP, Ball((0.0, 0.7, 0.3), 0.65))
     start = np.array([0.0, 0.1, 0.0])
     found = plan_pair(ridge_field, start, goal, PlanSpec())
     assert found.stays and found.certificate.gap == 0.0
@@ -107,11 +101,11 @@ def test_an_empty_workspace_names_its_axis():
 
 def test_a_random_start_lies_outside_a_large_goal(ridge_field):
     """By a quarter of the largest deflection, also where the goal is deeper than that."""
-    goal = TargetGoal(Ball((0.0, 0.9, 0.3), 0.8))
+    goal = Goal(TIP, Ball((0.0, 0.9, 0.3), 0.8))
     away = np.linalg.norm(ridge_field.samples.positions - ridge_field.rest, axis=1)
     for seed in range(4):
         start = random_start(ridge_field, goal, PlanSpec(), seed)
-        outside = goal.distance(ridge_field, start[None])[0] - goal.tolerance
+        outside = goal.excess(ridge_field, start[None])[0]
         assert outside >= 0.25 * away.max()
 
 
@@ -119,10 +113,10 @@ def test_a_second_arm_reaches_a_part_of_the_poses_and_not_rest(ridge_field):
     """The paper's goal: a ball of that arm's reach, into which the tip must be moved."""
     goal = second_arm_goal(ridge_field)
     points = ridge_field.region.draw(2000, np.random.default_rng(0))
-    assert 0.02 < (goal.distance(ridge_field, points) <= goal.tolerance).mean() < 0.5
-    assert goal.distance(ridge_field, ridge_field.rest[None])[0] > goal.tolerance + 0.01
+    assert 0.02 < (goal.excess(ridge_field, points) <= 0.0).mean() < 0.5
+    assert goal.excess(ridge_field, ridge_field.rest[None])[0] > 0.01
     far = default_goal(ridge_field, 0.01).centre(ridge_field)
-    assert goal.distance(ridge_field, far[None])[0] < goal.tolerance
+    assert goal.excess(ridge_field, far[None])[0] < 0.0
 
 
 def test_the_goal_of_a_demo_is_a_small_ball_that_the_tip_reaches(ridge_field):
@@ -130,8 +124,8 @@ def test_the_goal_of_a_demo_is_a_small_ball_that_the_tip_reaches(ridge_field):
     goal = tip_goal(ridge_field)
     points = ridge_field.region.draw(20_000, np.random.default_rng(0))
     assert goal.tolerance <= 0.02
-    assert (goal.distance(ridge_field, points) <= goal.tolerance).any()
-    assert goal.distance(ridge_field, ridge_field.rest[None])[0] > goal.tolerance
+    assert (goal.excess(ridge_field, points) <= 0.0).any()
+    assert goal.excess(ridge_field, ridge_field.rest[None])[0] > 0.0
 
 
 @pytest.mark.parametrize(("settings", "words"), [

@@ -14,8 +14,9 @@ from limber.planning.baseline_and_plan import _shortest_known
 from limber.planning.compared_planners import BASELINE, COMPARED, run_trials, summarised
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights, arc_lengths, measure_path
-from limber.planning.goals.goal import Ball, goal_points
-from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal, default_goal
+from limber.planning.goals.goal import TIP, Goal, goal_points, grasp_goal
+from limber.planning.goals.goal_kinds import default_goal
+from limber.planning.goals.region import Ball
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.rrt_star import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, OmplRrtStar, plan_path
@@ -24,7 +25,7 @@ from limber.stages.paths.compare import ComparePlanners
 from limber.stages.registry import stage_class
 
 START = np.array([-0.13, 0.0, 0.0])
-GOAL = GraspGoal((0.13, 0.0, 0.0), 0.01)
+GOAL = grasp_goal((0.13, 0.0, 0.0), 0.01)
 ENGINES = ["own", pytest.param("ompl", marks=pytest.mark.skipif(
     bool(OmplRrtStar().missing()), reason=f"OMPL: {OmplRrtStar().missing()}"))]
 
@@ -55,7 +56,7 @@ def test_deformation_aware_path_goes_round_the_ridge(ridge_field, engine):
     assert first.length_m < second.length_m < 1.25 * first.length_m
     for found in (baseline, gentle):
         assert np.allclose(found.points[0], START)
-        assert GOAL.distance(ridge_field, found.points[-1:])[0] <= GOAL.tolerance + 1e-9
+        assert GOAL.excess(ridge_field, found.points[-1:])[0] <= 1e-9
         assert ridge_field.region.contains(found.points).all()
         assert found.cost <= found.tree_cost + 1e-9
 
@@ -132,23 +133,23 @@ def test_goal_behind_a_wall(ridge_field):
 
 def test_tip_goal_brings_the_tip_there(ridge_field):
     """Grasp positions for a tip goal put the tip, by the field, within the tolerance."""
-    goal = TargetGoal(Ball((0.15, -0.05, 0.33), 0.01))
+    goal = Goal(TIP, Ball((0.15, -0.05, 0.33), 0.01))
     points = goal_points(goal, ridge_field, ridge_field.limited())
     assert len(points) > 20
     assert np.linalg.norm(ridge_field.tip(points) - goal.region.centre, axis=1).max() <= 0.01
     found = plan_path(make_problem(ridge_field, deformation=1.0, goal=goal),
                       Search(iterations=800, seed=1))
-    assert goal.distance(ridge_field, found.points[-1:])[0] <= goal.tolerance + 1e-9
+    assert goal.excess(ridge_field, found.points[-1:])[0] <= 1e-9
 
 
 def test_default_goal_is_far_and_reachable(ridge_field):
     """The default goal is deflected far, trusted, and gentle among the far poses."""
     goal = default_goal(ridge_field, 0.01)
-    away = np.linalg.norm(np.array(goal.position) - ridge_field.rest)
+    away = np.linalg.norm(goal.region.middle - ridge_field.rest)
     assert away > 0.6 * 0.2
-    assert ridge_field.region.contains(np.array(goal.position))[0]
+    assert ridge_field.region.contains(goal.region.middle)[0]
     far = np.linalg.norm(ridge_field.samples.positions, axis=1) > 0.15
-    at_goal = ridge_field.energy(np.array(goal.position))[0]
+    at_goal = ridge_field.energy(goal.region.middle)[0]
     assert at_goal < np.median(ridge_field.samples.energies[far])
 
 
@@ -189,7 +190,7 @@ SETTINGS = PlanSpec(iterations=300, engine="own", seed=3)
 
 @pytest.fixture(scope="module")
 def trials(ridge_field):
-    return run_trials(ridge_field, GraspGoal((0.1, 0.06, 0.02), 0.02), SETTINGS, 3)
+    return run_trials(ridge_field, grasp_goal((0.1, 0.06, 0.02), 0.02), SETTINGS, 3)
 
 
 def test_trials_start_elsewhere_and_are_scored_alike(trials, ridge_field):

@@ -34,8 +34,8 @@ from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.planning.field.radial import LocalError
 from limber.planning.field.sampling import solve_branch
 from limber.planning.field.stored_states import States
-from limber.planning.goals.goal import CellPlace, GoalRequest
-from limber.planning.goals.goal_kinds import GraspGoal, default_goal, goal_of, near
+from limber.planning.goals.goal import CellPlace, Goal, GoalRequest, grasp_goal
+from limber.planning.goals.goal_kinds import default_goal, goal_of
 from limber.planning.make_plan import PlannedMotion, plan_motion
 from limber.planning.path_on_full_model import ResolvedPath, resolve_path
 from limber.planning.path_problem import BlockedError, GentleProblem, random_start
@@ -120,7 +120,7 @@ class Start:
         return self.subject.model
 
     @property
-    def goal(self) -> GraspGoal:
+    def goal(self) -> Goal:
         return default_goal(self.known, 0.01)
 
     def place(self, settings: PlanSpec) -> np.ndarray:
@@ -155,7 +155,7 @@ def _measure(start: Start, place: np.ndarray, settings: PlanSpec,
     """Plan without limits; return values, the field at the end of planning, the path [n, 3]."""
     goal = start.goal
     motion = plan_motion(start.known, start.model, settings.model_copy(update={
-        "start": tuple(map(float, place)), "goal": goal.position,
+        "start": tuple(map(float, place)), "goal": tuple(map(float, goal.region.middle)),
         "goal_tolerance": goal.tolerance}), workers=1)
     summary, learnt, rounds = motion.summary, motion.field, motion.summary["rounds"]
     certificate, scales = summary["certificate"], summary["weights"]
@@ -362,7 +362,7 @@ def _free_path(model: GraspModel, known: EnergyField, branch: str, seed: int,
     if (branch, seed) in _free_paths:
         return _free_paths[branch, seed]
     free = PlanSpec(seed=seed, inertia=False, iterations=500, goal_tolerance=0.01)
-    goal = random_start(known, near(known.rest, 0.01), free, seed)
+    goal = random_start(known, grasp_goal(known.rest, 0.01), free, seed)
     asked = free.model_copy(update={"goal": tuple(map(float, goal))})
     peaks = _peaks(plan_motion(known, model, asked, workers=1).plan.ahead)
     return _free_paths.setdefault((branch, seed), (asked, peaks))
@@ -392,7 +392,7 @@ def run_near_limit(start: Start) -> dict[str, Any]:
         found["excess"] = _peaks(again.ahead)[name] / limit - 1.0 if again.is_whole else np.inf
     if name == LIMITED[0]:
         # Off the low-energy surface forces differ a hundredfold: the least of many counts.
-        there = near(np.array(asked.goal), asked.goal_tolerance).guess(
+        there = grasp_goal(np.array(asked.goal), asked.goal_tolerance).guess(
             start.known, _IN_GOAL, np.random.default_rng(0))
         force = _HOPELESS * float(np.linalg.norm(start.known.force(there), axis=1).min())
         found["hopeless"], found["hopeless_seconds"], _ = _said(
@@ -522,7 +522,7 @@ def _drawn(kind: float | str, known: EnergyField, model: GraspModel, generator: 
             goal = goal_of(GoalRequest(known, model, settings, known.limited(), cell))
         except NoPathError:
             continue
-        away = goal.distance(known, points) - goal.tolerance
+        away = goal.excess(known, points)
         share = float((away <= 0.0).mean())
         low, high = (0.0, 1.0) if kind in (0.005, 0.05) else _SHARES
         if low <= share <= high and away.max() > 0.005:
@@ -614,7 +614,7 @@ def run_sure(start: Start, draws: int) -> dict[str, Any]:
     """
     unknown = uncertainty_of(start.subject)
     motion, cap, tight = _sure_plan(start, unknown, PlanSpec(
-        seed=start.seed, iterations=500, goal=start.goal.position,
+        seed=start.seed, iterations=500, goal=tuple(map(float, start.goal.region.middle)),
         goal_tolerance=start.goal.tolerance))
     states = motion.plan.approach.joined(motion.plan.solved)
     high = np.flatnonzero(states.force_sizes > _LOW * cap)

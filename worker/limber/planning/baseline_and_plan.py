@@ -21,9 +21,9 @@ from limber.planning.goals.goal import (
     GoalOverLimitsError,
     allowed_points,
     goal_points,
+    grasp_goal,
     with_near_side,
 )
-from limber.planning.goals.goal_kinds import near
 from limber.planning.path_problem import (
     UNPROVEN,
     BlockedError,
@@ -413,7 +413,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     RRT*'s as in the paper. InputError if the start is not allowed, NoPathError if none."""
     limits = limits or Limits.of(settings).on(field)
     check_start(field, start, limits)
-    if goal.distance(field, start[None])[0] <= goal.tolerance:
+    if goal.excess(field, start[None])[0] <= 0.0:
         return _staying(field, start, goal, settings, limits, beyond)
     nobody: GoalOverLimitsError | None = None
     try:
@@ -572,7 +572,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
         return field.rest[None]
     cost = CostWeights.between(field, field.rest, start, distance=settings.weights[1],
                                deformation=settings.weights[0])
-    goal = near(start, _AT_START)
+    goal = grasp_goal(start, _AT_START)
     path = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), goal,
                          beyond=problem.beyond, errors=problem.errors)
     line = np.linspace(field.rest, start, 40)
@@ -580,7 +580,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     if not np.isfinite(least):
         try:
             rough = plan_path(PathProblem(
-                field, problem.limits, cost.weights, field.rest, near(start, 1e-9),
+                field, problem.limits, cost.weights, field.rest, grasp_goal(start, 1e-9),
                 goals=start[None]), Search(iterations=1500, seed=settings.seed)).points
             points, _ = refine(rough, path)
         except NoPathError:

@@ -33,8 +33,8 @@ from limber.planning.field.energy_field import UNITS, EnergyField, limited, refi
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import solve_branch
 from limber.planning.field.stored_states import States
-from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
-from limber.planning.goals.goal_kinds import TargetGoal, goal_of, near
+from limber.planning.goals.goal import CellPlace, Goal, GoalRequest, grasp_goal
+from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.path_on_full_model import (
     ResolvedPath,
     resolve_path,
@@ -119,7 +119,7 @@ def _chosen(wall: np.ndarray) -> np.ndarray:
 def _meets(field: EnergyField, goal: Goal, state: States) -> bool:
     """Return whether a state is in the goal, or nearer to it than the field's error allows."""
     place, missed = state.positions, goal.missed_by(state)
-    by_field = float(goal.distance(field, place)[0]) - goal.tolerance
+    by_field = float(goal.excess(field, place)[0])
     return missed <= 0.0 or missed < by_field - float(goal.uncertainty(field, place)[0])
 
 
@@ -190,7 +190,7 @@ def solved_if_undecided(field: EnergyField, grasp_model: GraspModel, start: np.n
     approach = field.rest[None]
     if np.linalg.norm(start - field.rest) >= STEP:
         to_start = easiest_path(field, limits.on(field), field.rest.copy(),
-                                near(start, STEP))
+                                grasp_goal(start, STEP))
         approach = approach if to_start is None else np.concatenate([to_start.points, start[None]])
     solved = resolve_path(grasp_model, resample(path.points, STEP), approach, progress)
     found = learnt(field, grasp_model, solved, limits)
@@ -282,13 +282,11 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     """
     own = Limits.of(settings)
     goal = goal_of(GoalRequest(field, grasp_model, settings, own.on(field), cell or {}))
-    if isinstance(goal, TargetGoal):
-        field = goal.grown(field, grasp_model)
+    field = goal.grown(field, grasp_model)
     start, limits = start_of(field, goal, settings), limits or own
     if limits.constraints:
         field = with_constraints(field, grasp_model, limits, workers, progress)
-    aim = goal.with_margin(field, limits.on(field), start) if isinstance(
-        goal, TargetGoal) else goal
+    aim = goal.with_margin(field, limits.on(field), start)
     rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, aim,
                      limits, pace or Pace(settings.speed), progress)
     count = _REPLANS + 1
@@ -379,7 +377,7 @@ class _Rounds:
         """Whether the field's error decides how deep in the goal the plan ends. If so, its last
         states become samples, and it is kept for the case that no better one holds."""
         end = pair.plan.points[-1:]
-        if pair.stays or not isinstance(self.aim, TargetGoal) or (
+        if pair.stays or (
                 self.aim.margin_at(self.field, end) < ENOUGH * arc_lengths(pair.plan.points)[-1]):
             return False
         self.holding = {"pair": pair, "plan": plan, "moving": self.moving, "risks": self.risks[:]}
@@ -413,8 +411,7 @@ class _Rounds:
         """Return paths on the field that end as deep in the goal as the field's error and earlier
         plans ask for; if none is found, less deep ones. NoPathError if none ends in it."""
         # Probably the first plan to a region ends too deep in it, and a later one is refused.
-        is_deep = isinstance(self.aim, TargetGoal) and self.aim.margin > 0.0
-        is_bounded = self.holding is not None or (self.pair is None and not is_deep)
+        is_bounded = self.holding is not None or (self.pair is None and not self.aim.margin)
 
         try:
             return plan_within(self.field, self.start, self.aim, self.settings,
@@ -423,7 +420,7 @@ class _Rounds:
                                progress=ahead.part(0.0, 0.5))
         except NoPathError as none:
             aim, proven = self.aim, isinstance(none, BlockedError) and none.is_proven
-            if proven or not (isinstance(aim, TargetGoal) and (aim.margin or aim.inset)):
+            if proven or not (aim.margin or aim.inset):
                 raise
             if aim.margin:
                 self.progress.warn(

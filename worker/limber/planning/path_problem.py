@@ -101,7 +101,7 @@ class GentleProblem:
 
     def goal_excess(self, point: np.ndarray) -> float:
         """Return how far ``point`` [3] is outside the goal region [m], negative inside."""
-        return float(self.goal.distance(self.energy_field, point[None])[0]) - self.goal.tolerance
+        return float(self.goal.excess(self.energy_field, point[None])[0])
 
 
 def least_over(problem: GentleProblem, points: np.ndarray) -> np.ndarray:
@@ -162,8 +162,7 @@ def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: i
     points = field.region.draw(4000, generator)
     half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
     fit = np.linalg.norm(points - field.rest, axis=1) >= half
-    away = goal.distance(field, points)
-    fit &= (away >= half) & (away >= goal.tolerance + 0.5 * half)
+    fit &= goal.excess(field, points) >= max(half - goal.tolerance, 0.5 * half)
     fit &= allowed_points(points, Limits.of(settings).on(field))
     if not fit.any():
         raise NoPathError("No allowed deformed start is far from rest and far from the goal.",

@@ -65,12 +65,12 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
         positions, nodes = cells.nodes()
         over, uncertainty = _surely_over(problem, cells, positions, nodes)
         begin = cells.holding(problem.start)
-        away = problem.goal.distance(problem.energy_field, positions)[nodes]
+        away = problem.goal.excess(problem.energy_field, positions)[nodes]
         least, bends = _least(away)
-        tolerance, off = problem.goal.tolerance, np.zeros(len(positions))
+        off = np.zeros(len(positions))
         if not is_exact:
             off = problem.goal.uncertainty(problem.energy_field, positions)
-        short = least - off[nodes].max(axis=1) - tolerance
+        short = least - off[nodes].max(axis=1)
         ends = ~over & (short <= 0.0)
         kept = allowed_points(positions, problem.limits)[nodes]
         open_cells = np.flatnonzero(~over | begin)
@@ -82,7 +82,7 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
             return Verdict(cells.edges, proven=True, wall=wall.about(reached), nearest=_nearest(
                 reached, short[open_cells][connected]) if off.any() else _NOWHERE)
         free = kept[open_cells][:, AT].all(axis=1)
-        reached = free & (away[open_cells][:, AT] <= tolerance).any(axis=1)
+        reached = free & (away[open_cells][:, AT] <= 0.0).any(axis=1)
         inner = cells.take(free)
         path = inner.path(begin[free], reached[free])
         if path is not None:
@@ -94,7 +94,7 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
             # Along the shell: the chord of a curved cell may be well off it.
             return Verdict(cells.edges, path=chart.curved(resample(flat, _FINE)))
         uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
-                                 (bends / tolerance)[open_cells][ends].sum(axis=0))
+                                 (bends / problem.goal.tolerance)[open_cells][ends].sum(axis=0))
         parts = np.where(uncertainty >= _DOUBTED * uncertainty.max(), 2, 1)
         if connected.sum() * parts.prod() > most_cells:
             return Verdict(cells.edges)

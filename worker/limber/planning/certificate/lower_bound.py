@@ -216,8 +216,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     if len(cells) == 0:
         return AboutGoal(nothing, np.zeros(shape), nothing, nothing, False, nothing)
     goal = problem.bounded_goal
-    away = (goal.distance(problem.energy_field, grid.points(cells + 0.5))
-            - goal.tolerance)
+    away = goal.excess(problem.energy_field, grid.points(cells + 0.5))
     # In the bounding box of these cells only, with a margin layer of unknown values.
     low, high = np.maximum(cells.min(axis=0) - 1, 0), cells.max(axis=0) + 2
     box = tuple(map(slice, low, high))

@@ -25,7 +25,7 @@ from limber.mechanics.materials.materials import strain_limit
 from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
 from limber.planning.field.radial import LocalError, Slack, slack_of
 from limber.planning.field.stored_states import States
-from limber.planning.goals.goal import empty_along
+from limber.planning.goals.region import empty_along
 from limber.planning.settings import PlanSettings
 
 

@@ -8,295 +8,58 @@ from typing import Self
 import numpy as np
 
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
-from limber.planning.field.energy_field import EnergyField, FieldArrays, refit
+from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import solve_branch
 from limber.planning.field.stored_states import States
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import (
-    NEARER,
-    Ball,
-    BoxRegion,
+    TIP,
     CellPlace,
-    Convex,
     Goal,
     GoalKind,
     GoalRequest,
-    Region,
+    Point,
     allowed_points,
-    ball,
-    empty_along,
-    position_text,
+    grasp_goal,
 )
+from limber.planning.goals.region import Ball, BoxRegion, ball, empty_along
 from limber.planning.settings import PlanSettings
 
-# The grasp at a position: ``--goal``.
+# A point of the branch where a user asks for it: ``--goal``, ``--tip-goal``, ``--target-box``.
 
 
-@dataclass(frozen=True)
-class GraspGoal:
-    """The grasp within ``tolerance`` [m] of ``position`` [m]."""
-
-    position: tuple[float, float, float]
-    tolerance: float
-
-    what = "the grasp"
-    advice = NEARER
-
-    @property
-    def where(self) -> str:
-        return f"within {self.tolerance:.3f} m of {position_text(self.position)} m"
-
-    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(np.asarray(points) - self.position, axis=1)
-
-    def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        return np.zeros(len(points))
-
-    def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
-        inside = ball(count, generator) * self.tolerance + self.position
-        inside[0] = self.position
-        return inside
-
-    def centre(self, field: EnergyField) -> np.ndarray:
-        return np.array(self.position, float)
-
-    def missed_by(self, states: States) -> float:
-        return float(np.linalg.norm(states.poses[-1, :3] - self.position)) - self.tolerance
-
-    def drawn_in(self, states: States) -> "GraspGoal":
-        return self
-
-    def require_end(self, grasp_model: GraspModel, states: States) -> None:
-        pass
-
-    def describe(self) -> dict:
-        return {"kind": "grasp", "position_m": list(map(float, self.position)),
-                "tolerance_m": self.tolerance}
-
-    def describe_end(self, states: States) -> dict:
-        return {}
-
-
-def near(position: np.ndarray, tolerance: float) -> GraspGoal:
-    """Return the goal of a grasp within ``tolerance`` [m] of ``position`` [3]."""
-    x, y, z = map(float, position)
-    return GraspGoal((x, y, z), tolerance)
-
-
-AT_PLACE = GoalKind(
-    "goal", lambda asked, place: near(place, asked.settings.goal_tolerance), is_place=True)
-
-
-# A point on the branch, its tip or a named target, in a region: ``--tip-goal``, ``--target-box``.
-
-_COVERED = 0.95  # fraction of the samples that the margin covers
-_MOST = 0.4  # fraction of a region's depth; where the field is worse, the full model decides
-_SHARES = (1.0, 0.5, 0.2)  # fractions of the margin that are tried
-_DRAWN = 200  # poses with which they are
-_SMALL = 0.02  # [m] depth of a region up to which targets are drawn in all of it
-_HALVINGS = 12  # halvings of a path into a region
-_GROWN = 8  # most states of the branch model towards a region
-
-
-@dataclass(frozen=True)
-class TargetGoal:
-    """A point on the branch within a region of space.
-
-    Attributes:
-        region: Region for the point.
-        target: Number of the named target; None: the branch's tip.
-        name: Name of the target.
-        inset: Distance that plans keep from the region's outside [m]: what an earlier one missed.
-        margin: Fraction of the field's error at each pose that plans keep from it as well.
-        advice: As for any goal.
-    """
-
-    region: Region
-    target: int | None = None
-    name: str = "tip"
-    inset: float = 0.0
-    margin: float = 0.0
-    advice: str = NEARER
-
-    @property
-    def tolerance(self) -> float:
-        """Distance of the region's middle from its outside [m]."""
-        return self.region.depth
-
-    @property
-    def what(self) -> str:
-        return f"the {self.name}"
-
-    @property
-    def where(self) -> str:
-        return f"within {self.region.words}"
-
-    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        outside = self.region.distance(field.tip(points, self.target))
-        return outside + self.tolerance + self._kept_off(field, points)
-
-    def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        return self._kept_off(field, points) + field.place_errors(self.target, points)
-
-    def _kept_off(self, field: EnergyField, points: np.ndarray) -> np.ndarray | float:
-        """Return the distance from the region's outside that plans keep at ``points`` [m], [n]."""
-        return self.inset + self.margin_at(field, points)
-
-    def margin_at(self, field: EnergyField, points: np.ndarray) -> np.ndarray | float:
-        """Return the part of it due to the field's error [m], shape [n]."""
-        if self.margin == 0.0:
-            return 0.0
-        stated = field.place_errors(self.target, points, _COVERED)
-        stated = np.where(np.isfinite(stated), stated, 0.0)  # not known: the full model decides
-        return self.margin * np.minimum(stated, _MOST * self.tolerance)
-
-    def with_margin(self, field: EnergyField, limits: FieldArrays, start: np.ndarray) -> Self:
-        """Return the goal less the field's error in the target's position, or the largest of a few
-        fractions of it with which a drawn pose keeps ``limits``; all of it if the ``start`` [3] is
-        in it.
-        """
-        if self.distance(field, start[None])[0] <= self.tolerance:
-            return self
-        for share in _SHARES:
-            part = replace(self, margin=share)
-            points = part.guess(field, _DRAWN, np.random.default_rng(0))
-            reached = part.distance(field, points) <= part.tolerance
-            if allowed_points(np.ascontiguousarray(points[reached]), limits).any():
-                return part
-        return self
-
-    def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
-        # A small region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
-        # Points already in it stay: in a large one a walk may lead out of the samples.
-        drawn = field.region.draw(20 * count, generator)
-        distance = self.distance(field, drawn)
-        points = drawn[distance <= self.tolerance][:count]
-        found = np.concatenate([points, self._walked(
-            field, drawn[np.argsort(distance)[len(points):count]], generator)])
-        if (self.distance(field, found) <= self.tolerance).any():
-            return found
-        # Where the target moves far within millimetres of the grasp, draws miss a region that a
-        # sample is in, or near to.
-        known = field.samples.positions
-        known = known[np.argsort(self.distance(field, known), kind="stable")[:count]]
-        return np.concatenate([found, known, self._walked(field, known, generator)])
-
-    def _walked(self, field: EnergyField, points: np.ndarray, generator: np.random.Generator,
-                ) -> np.ndarray:
-        """Return ``points`` [n, 3] moved so that the target approaches places in the region; none
-        leaves the box that was sampled, beyond which the field knows nothing."""
-        if not len(points):
-            return points
-        is_inside = self._entered(field.tip(points, self.target),
-                                  self.region.draw(len(points), generator))
-        for _ in range(8):
-            outside = self.distance(field, points) > 0.5 * self.tolerance
-            steps = _damped_steps(field.tip_gradient(points, self.target),
-                                  is_inside - field.tip(points, self.target))
-            points = np.clip(points + np.where(outside[:, None], steps, 0.0), field.region.low,
-                             field.region.high)
-        return points
-
-    def _entered(self, positions: np.ndarray, is_inside: np.ndarray) -> np.ndarray:
-        """Points [n, 3] just inside the region on the path to places inside: in a large region
-        others are far out of the branch's reach."""
-        inside = 0.25 * self.tolerance if self.tolerance < _SMALL else 0.25 * _SMALL
-        low, high = np.zeros(len(positions)), np.ones(len(positions))
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + high)
-            deep = self.region.distance(
-                positions + middle[:, None] * (is_inside - positions)) <= -inside
-            low, high = np.where(deep, low, middle), np.where(deep, middle, high)
-        return positions + high[:, None] * (is_inside - positions)
-
-    def grown(self, field: EnergyField, grasp_model: GraspModel) -> EnergyField:
-        """Return the field with states of the branch model on the way from the sample nearest to
-        the region into it, where the field has no pose in it; as it is if the way does not end
-        there."""
-        drawn = self.guess(field, _DRAWN, np.random.default_rng(0))
-        nearest = int(self.region.distance(self.target_positions(field.samples)).argmin())
-        place, states = field.samples.positions[nearest][None], list[States]()
-        while len(states) < _GROWN and (self.distance(field, drawn) > self.tolerance).all():
-            found = solve_branch(grasp_model, place, workers=1)[0]
-            if not found:
-                break
-            states.append(found[0].state)
-            if len(states) > 1 and self.missed_by(states[-1]) <= 0.0:
-                return refit(field, States.joined(*states[1:]))
-            tip = self.target_positions(states[-1])
-            place = place + _damped_steps(field.tip_gradient(place, self.target),
-                                          self._entered(tip, self.region.middle[None]) - tip)
-        return field
-
-    def centre(self, field: EnergyField) -> np.ndarray:
-        points = self.guess(field, 50, np.random.default_rng(0))
-        trusted = points[field.region.contains(points)]
-        points = trusted if len(trusted) else points
-        return points[np.argmin(self.distance(field, points))]
-
-    def target_positions(self, states: States) -> np.ndarray:
-        """Return the target's position in each state [m], shape [n, 3]."""
-        return states.tips if self.target is None else states.targets[:, self.target]
-
-    def missed_by(self, states: States) -> float:
-        """Return how far outside the region the target is in the last state [m]; inside: below 0.
-        """
-        return float(self.region.distance(self.target_positions(states))[-1])
-
-    def drawn_in(self, states: States) -> Self:
-        """Return the goal moved inwards by the last state's distance from it, at most half."""
-        missed = max(self.missed_by(states), 0.0)
-        return replace(self, inset=min(self.inset + 1.5 * missed, 0.5 * self.tolerance))
-
-    def require_end(self, grasp_model: GraspModel, states: States) -> None:
-        pass
-
-    def describe(self) -> dict:
-        return {"kind": "tip" if self.target is None else "target", "target": self.name,
-                "position_m": self.region.middle.tolist(), "tolerance_m": self.tolerance,
-                "region": self.region.describe()}
-
-    def describe_end(self, states: States) -> dict:
-        return {"target_end_m": self.target_positions(states)[-1]}
-
-
-def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Gauss-Newton steps [n, 3] for d tip_c / d x_k = ``slope`` [n, k, c], damped where flat."""
-    normal = slope @ slope.transpose(0, 2, 1) + 1e-3 * np.eye(3)
-    return np.linalg.solve(normal, slope @ missing[:, :, None])[:, :, 0]
-
-
-def target_of(asked: GoalRequest) -> tuple[int | None, str]:
-    """Return number and name of the requested target. InputError if the branch has no target of
-    that name."""
+def target_of(asked: GoalRequest) -> Point:
+    """Return the requested target, or the tip. InputError if the branch has no target of that
+    name."""
     name = asked.settings.target
     names = [target.name for target in asked.grasp_model.branch.targets]
     if name is None:
-        return None, "tip"
+        return TIP
     if name not in names:
         raise InputError(f"The branch has no target named {name}.",
                          f"Its targets are: {', '.join(names) or 'none'}.",
                          "Define one with ", Command("target"), ".")
-    return names.index(name), name
+    return Point(name, names.index(name))
 
 
-def _in_ball(asked: GoalRequest, centre: tuple[float, float, float]) -> TargetGoal:
-    return TargetGoal(Ball(centre, asked.settings.goal_tolerance), *target_of(asked))
+def _in_ball(asked: GoalRequest, centre: tuple[float, float, float]) -> Goal:
+    return Goal(target_of(asked), Ball(centre, asked.settings.goal_tolerance))
 
 
-def _in_box(asked: GoalRequest, corners: tuple[float, ...]) -> TargetGoal:
+def _in_box(asked: GoalRequest, corners: tuple[float, ...]) -> Goal:
     x, y, z, *far = corners
     low, high = (x, y, z), (far[0], far[1], far[2])
     if not np.all(np.less(low, high)):
         raise InputError(f"The target's box is empty {empty_along(low, high)}.",
                          "Its lower corner must be below the upper one in x, y and z.",
                          "Correct ", Option("target_box"), ".")
-    return TargetGoal(BoxRegion(low, high), *target_of(asked),
-                      advice=Text("Choose a larger ", Option("target_box"), ", or one nearer to "
-                                  "this region"))
+    return Goal(target_of(asked), BoxRegion(low, high), advice=Text(
+        "Choose a larger ", Option("target_box"), ", or one nearer to this region"))
 
 
+AT_PLACE = GoalKind(
+    "goal", lambda asked, place: grasp_goal(place, asked.settings.goal_tolerance), is_place=True)
 IN_BALL = GoalKind("tip_goal", _in_ball, is_of_target=True, is_place=True)
 IN_BOX = GoalKind("target_box", _in_box, is_of_target=True)
 
@@ -310,7 +73,7 @@ _TIP_TOLERANCE = 0.02  # [m] about a flower's radius
 _BEGINS = 0.6  # fraction of the tip's way to the default goal at which that reach begins
 
 
-def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
+def default_goal(field: EnergyField, tolerance: float) -> Goal:
     """Return a goal far from rest that needs no force: the sample of least energy among those over
     three quarters of the largest deflection, moved a little towards rest. Trust is a shell often
     thinner than the tolerance: what counts is the part of the goal along it."""
@@ -328,34 +91,34 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
             position = chart.curved(centre[None])[0]
             if (field.region.contains(chart.curved(centre + around)).mean() > 0.5
                     and field.region.contains(position)[0]):
-                return near(position, tolerance)
+                return grasp_goal(position, tolerance)
     raise NoPathError("No distant pose lies well inside the sampled region.",
                       f"Too few of the {len(away)} accepted samples are far from the rest pose.",
                       "Sample more poses with ", Command("energy", Option("samples")), ", or give "
                       "a ", Option("goal"), ".")
 
 
-def second_arm_goal(field: EnergyField) -> TargetGoal:
+def second_arm_goal(field: EnergyField) -> Goal:
     """The paper's goal: the tip with its flower in a second arm's reach, a ball on the side to
     which the branch bends with least energy. NoPathError if there is no far pose."""
     far = default_goal(field, 0.01).centre(field)
     rest, there = field.tip(np.stack([field.rest, far]))
     way = there - rest
     x, y, z = map(float, rest + (_BEGINS + _REACH / np.linalg.norm(way)) * way)
-    return TargetGoal(Ball((x, y, z), _REACH))
+    return Goal(TIP, Ball((x, y, z), _REACH))
 
 
-def tip_goal(field: EnergyField) -> TargetGoal:
+def tip_goal(field: EnergyField) -> Goal:
     """A goal as a person states one: a small ball some centimetres from the tip, which is there
     with the grasp half-way to the default goal. NoPathError if there is no far pose."""
     chart = field.region.chart.plain
     rest, far = chart.map(np.stack([field.rest, default_goal(field, 0.01).centre(field)]))
     x, y, z = map(float, field.tip(chart.curved((rest + _HALF * (far - rest))[None]))[0])
-    return TargetGoal(Ball((x, y, z), _TIP_TOLERANCE))
+    return Goal(TIP, Ball((x, y, z), _TIP_TOLERANCE))
 
 
 def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,
-                    tolerance: float, seed: int) -> GraspGoal:
+                    tolerance: float, seed: int) -> Goal:
     """A goal drawn as the paper's: evenly in the half ball of the branch's length above its base
     [m], in the trusted field, within limits, at least half the largest deflection from rest.
     NoPathError if none was found."""
@@ -369,10 +132,10 @@ def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits:
                           f"A distant pose is at least {half:.3f} m from rest; the hemisphere's "
                           f"radius is {length:.3f} m.",
                           "Give a ", Option("goal"), ", or relax the limits.")
-    return near(points[np.flatnonzero(fit)[0]], tolerance)
+    return grasp_goal(points[np.flatnonzero(fit)[0]], tolerance)
 
 
-def _drawn(asked: GoalRequest, seed: int) -> GraspGoal:
+def _drawn(asked: GoalRequest, seed: int) -> Goal:
     reach = asked.grasp_model.reach
     return hemisphere_goal(asked.field, reach.base, reach.arc_length, asked.limits,
                            asked.settings.goal_tolerance, seed)
@@ -400,7 +163,7 @@ _NOWHERE = np.empty((0, 3))
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellGoal(TargetGoal):
+class CellGoal(Goal):
     """A target at a valid position in a region of the cell. ``taken`` and ``refused`` are grasp
     positions [m] in it where it is valid or not, and ``causes`` why not, as clauses. ``caution`` is
     how many times nearer to a valid one than to an invalid one a plan ends."""
@@ -416,14 +179,14 @@ class CellGoal(TargetGoal):
     def where(self) -> str:
         return f"within {self.cell_place.words}"
 
-    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        within = super().distance(field, points)
+    def excess(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        within = super().excess(field, points)
         if not len(self.refused) or not len(self.taken):
             return within
         points = np.ascontiguousarray(points, float).reshape(-1, 3)
         nearer = (self.caution * nearest_of(points, self.taken)[0]
                   - nearest_of(points, self.refused)[0])
-        return np.maximum(within, self.tolerance + nearer / (1.0 + self.caution))
+        return np.maximum(within, nearer / (1.0 + self.caution))
 
     def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         # Between invalid poses there may be a valid one: then nothing is proven.
@@ -433,7 +196,7 @@ class CellGoal(TargetGoal):
 
     def drawn_in(self, states: States) -> Self:
         found = super().drawn_in(states)._met(states)
-        if not len(found.taken) or not self._cause(self.target_positions(states)[-1],
+        if not len(found.taken) or not self._cause(self.point.in_states(states)[-1],
                                                    states.displacements[-1]):
             return found
         # What the field takes for valid may not be: the branch model says what is.
@@ -442,7 +205,7 @@ class CellGoal(TargetGoal):
         return replace(known if len(known.taken) else found, caution=found.caution * _WARIER)
 
     def require_end(self, grasp_model: GraspModel, states: States) -> None:
-        self.cell_place.require(self.what, self.target_positions(states)[-1],
+        self.cell_place.require(self.what, self.point.in_states(states)[-1],
                                 self._surface(states.displacements[-1]))
 
     def learnt(self, field: EnergyField) -> Self:
@@ -453,9 +216,9 @@ class CellGoal(TargetGoal):
         else:
             points = np.concatenate([field.rest[None], field.region.draw(
                 _PLACES_DRAWN, np.random.default_rng(0))])
-            points = points[TargetGoal.distance(self, field, points) <= self.tolerance][:_ASKED]
-            found = self._asked(points, field.tip(points, self.target), None)._sharpened(
-                lambda middle: [self._cause(one, None) for one in field.tip(middle, self.target)],
+            points = points[Goal.excess(self, field, points) <= 0.0][:_ASKED]
+            found = self._asked(points, self.point.at(field, points), None)._sharpened(
+                lambda middle: [self._cause(one, None) for one in self.point.at(field, middle)],
                 _PAIRS, _PAIR_HALVINGS)
         if len(found.refused) and not len(found.taken):
             raise found.refusal()
@@ -485,14 +248,14 @@ class CellGoal(TargetGoal):
         """Test states of the branch model at samples of the field in the region, far apart, and
         between them."""
         inside = field.samples.positions[
-            self.region.distance(self.target_positions(field.samples)) <= 0.0]
+            self.region.distance(self.point.in_states(field.samples)) <= 0.0]
         if not len(inside):
             return self
 
         def causes_at(middle: np.ndarray) -> list[str]:
             causes = ["the branch has no equilibrium there"] * len(middle)
             for one in solve_branch(self.grasp_model, middle, workers=1)[0]:
-                causes[one.target] = self._cause(self.target_positions(one.state)[0],
+                causes[one.target] = self._cause(self.point.in_states(one.state)[0],
                                                  one.state.displacements[0])
             return causes
         return self._solved(inside[_far_apart(inside, _SOLVED)])._sharpened(
@@ -504,7 +267,7 @@ class CellGoal(TargetGoal):
         return self._met(States.joined(*found)) if found else self
 
     def _met(self, states: States) -> Self:
-        return self._asked(states.positions, self.target_positions(states), states.displacements)
+        return self._asked(states.positions, self.point.in_states(states), states.displacements)
 
     def _asked(self, grasps: np.ndarray, positions: np.ndarray, moved: np.ndarray | None) -> Self:
         """Return the goal with poses [n, 3] added that have the target at ``positions`` [n, 3]; the
@@ -561,7 +324,7 @@ def _in_cell(asked: GoalRequest, name: str) -> CellGoal:
                               f"{_ENTRIES[name]}."), "The cell file states its position.", "Give ",
                          Option("cell"), " with such a file.")
     place = asked.cell[name]
-    return CellGoal(place.region, *target_of(asked), advice=place.advice, cell_place=place,
+    return CellGoal(target_of(asked), place.region, advice=place.advice, cell_place=place,
                     grasp_model=asked.grasp_model).learnt(asked.field)
 
 
@@ -591,62 +354,3 @@ def goal_of(request: GoalRequest) -> Goal:
     if not asked:
         return default_goal(request.field, settings.goal_tolerance)
     return asked[0].make(request, getattr(settings, asked[0].name))
-
-
-# The view of a fixed camera, and occlusion of a target in it.
-
-
-@dataclass(frozen=True)
-class View(Convex):
-    """The view of a pinhole camera in the range of z [m]: its frame [4, 4] in the branch's (x
-    right, y down, z ahead), and x / z and y / z at the borders left, right, top, bottom."""
-
-    frame: np.ndarray
-    slopes: tuple[float, float, float, float]
-    range_m: tuple[float, float]
-
-    @property
-    def planes(self) -> np.ndarray:
-        left, right, top, bottom = self.slopes
-        near, far = self.range_m
-        own = np.array([[-1, 0, left, 0], [1, 0, -right, 0], [0, -1, top, 0], [0, 1, -bottom, 0],
-                        [0, 0, -1, near], [0, 0, 1, -far]], float)
-        own /= np.linalg.norm(own[:, :3], axis=1, keepdims=True)
-        normals = own[:, :3] @ self.frame[:3, :3].T
-        return np.column_stack([normals, own[:, 3] - normals @ self.frame[:3, 3]])
-
-    @property
-    def corners(self) -> np.ndarray:
-        left, right, top, bottom = self.slopes
-        own = np.array([[x * z, y * z, z] for z in self.range_m for x in (left, right)
-                        for y in (top, bottom)])
-        return own @ self.frame[:3, :3].T + self.frame[:3, 3]
-
-    @property
-    def words(self) -> str:
-        near, far = self.range_m
-        return (f"the image of the camera at {position_text(self.frame[:3, 3])} m that looks along "
-                f"{position_text(self.frame[:3, 2])}, {near:.3f} to {far:.3f} m ahead of it")
-
-    def describe(self) -> dict:
-        return {"camera_m": self.frame[:3, 3].tolist(), "axis": self.frame[:3, 2].tolist(),
-                "range_m": list(self.range_m)}
-
-    def hidden_by(self, triangles: np.ndarray, point: np.ndarray, slack: float) -> bool:
-        """Whether triangles [f, 3, 3] are between camera and ``point``, to which surface within
-        ``slack`` [m] belongs (Moeller and Trumbore 1997)."""
-        eye = self.frame[:3, 3]
-        ray = np.asarray(point, float) - eye
-        first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-        across = np.cross(ray, second)
-        volume = np.einsum("ij,ij->i", first, across)
-        # A triangle that the ray lies in hides nothing; rounding would give it a place anywhere.
-        size = np.linalg.norm(first, axis=1) * np.linalg.norm(across, axis=1)
-        safe = np.where(np.abs(volume) > 1e-9 * size + 1e-30, volume, np.inf)
-        to_eye = eye - triangles[:, 0]
-        u = np.einsum("ij,ij->i", to_eye, across) / safe
-        turned = np.cross(to_eye, first)
-        v = (turned @ ray) / safe
-        t = np.einsum("ij,ij->i", second, turned) / safe
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-        return bool((hit & (t < 1.0 - slack / np.linalg.norm(ray))).any())

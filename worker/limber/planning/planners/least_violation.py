@@ -44,8 +44,8 @@ def easiest_path(field: EnergyField, limits: FieldArrays, start: np.ndarray, goa
             return None
         cells, shares, changes = cells.take(known), shares[known], changes[known]
         flat, points = cells.middles()
-        away = goal.distance(field, points)
-        ends = away <= max(goal.tolerance, float(away.min()))
+        away = goal.excess(field, points)
+        ends = away <= max(0.0, float(away.min()))
         first = int(np.linalg.norm(points - start, axis=1).argmin())
         level = max(float(cells.levels(np.maximum(shares, _LEAST), first)[ends].min()), 1.0)
         if not np.isfinite(level):

@@ -345,9 +345,9 @@ class Excesses:
 
     def _at_end(self, points: np.ndarray, push: np.ndarray) -> np.ndarray:
         shifts = _STEP * np.concatenate([np.eye(3), -np.eye(3)])
-        distance = self.problem.goal.distance(self.problem.energy_field, points[-1] + shifts)
+        excess = self.problem.goal.excess(self.problem.energy_field, points[-1] + shifts)
         out = np.zeros_like(points)
-        out[-1] = push[0] * (distance[:3] - distance[3:]) / (2.0 * _STEP * self.scale)
+        out[-1] = push[0] * (excess[:3] - excess[3:]) / (2.0 * _STEP * self.scale)
         return out
 
     def _on_length(self, points: np.ndarray) -> _Excess:

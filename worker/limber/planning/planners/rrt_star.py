@@ -21,7 +21,7 @@ class PathProblem(GentleProblem):
 
     def in_goal(self, points: np.ndarray) -> np.ndarray:
         """Return whether positions [n, 3] are in the goal region, bool [n]."""
-        return self.goal.distance(self.energy_field, points) <= self.goal.tolerance
+        return self.goal.excess(self.energy_field, points) <= 0.0
 
     @property
     def low(self) -> np.ndarray:

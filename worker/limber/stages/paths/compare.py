@@ -95,7 +95,8 @@ class ComparePlanners(KeptStage, PlacedStage):
         """
         from limber.planning.compared_planners import run_trials, summarised
         from limber.planning.field.energy_field import EnergyField
-        from limber.planning.goals.goal_kinds import near, second_arm_goal
+        from limber.planning.goals.goal import grasp_goal
+        from limber.planning.goals.goal_kinds import second_arm_goal
         from limber.results.report.figures import planner_figure
 
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
@@ -109,7 +110,7 @@ class ComparePlanners(KeptStage, PlacedStage):
             return branch.manifest.stages[self.entry].result
         asked = PlanSettings(seed=self.seed, max_detour=self.max_detour)
         goal = (second_arm_goal(field) if self.goal is None
-                else near(np.array(self.goal), asked.goal_tolerance))
+                else grasp_goal(np.array(self.goal), asked.goal_tolerance))
         with branch.stage(self.entry, self, reads=reads) as stage:
             trials = run_trials(field, goal, asked, self.trials, progress=progress)
             good = [trial for trial in trials if trial.scores]

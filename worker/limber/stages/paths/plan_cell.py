@@ -23,8 +23,8 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.stored_states import States
-from limber.planning.goals.goal import Ball, CellPlace, position_text
-from limber.planning.goals.goal_kinds import View
+from limber.planning.goals.goal import CellPlace
+from limber.planning.goals.region import Ball, View, position_text
 from limber.planning.plan_file import PlanPath
 from limber.robot.depth_camera import LiveView
 from limber.robot.motion.execution import (
