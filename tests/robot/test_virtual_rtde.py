@@ -218,6 +218,20 @@ def test_the_ft300_stream_is_what_robotiq_sends(cb3):
     assert rows[:, 2].mean() == pytest.approx(40.0, abs=10.0)
 
 
+def test_a_reading_of_the_ft300_may_be_left_out():
+    def sent(seed: int) -> list[bool]:
+        server, wire = Server(Controller("ur5", seed=seed, ft300=True), "127.0.0.1"), Wire()
+        came = []
+        for _ in range(5000):
+            before = len(wire.sent)
+            assert server.send_ft300(wire)
+            came.append(len(wire.sent) > before)
+        return came
+
+    came = sent(3)
+    assert 8 <= came.count(False) <= 35 and came == sent(3) != sent(4)
+
+
 @pytest.mark.slow
 def test_the_process_ends_with_its_parents_pipe(own_address):
     robot = VirtualRobot("ur5e", own_address)

@@ -20,8 +20,9 @@ OVER_HARD = 1.1
 _LOOP_SECONDS = 0.002
 _STEPS = 2.0
 # Between two readings of an FT300, at most. By USB 62.5 a second were seen, and up to 32 ms between
-# two (ros-industrial-attic/robotiq, issue 124); of the URCap's stream its rate alone is known.
-_FT300_SECONDS = {"ft300": 0.010, "ft300_usb": 0.032}
+# two (ros-industrial-attic/robotiq, issue 124): a reading may come a period late. Of the URCap's
+# stream of 100 a second no measurement is known; it is taken to be no better.
+_FT300_SECONDS = {"ft300": 0.020, "ft300_usb": 0.032}
 # The joints brake at 8 rad/s^2; the joint that moves a gripper is rarely nearer than this.
 _BRAKING_M_S2 = 8.0 * 0.3
 _SLOWEST_M_S = 1e-3

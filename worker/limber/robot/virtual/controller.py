@@ -319,6 +319,7 @@ class Controller:
         self.tool_offset = np.zeros(6)
         self.mass, self.centre = mass, np.asarray(centre, float)
         self.payload, self.payload_centre = 0.0, np.zeros(3)
+        self.seed = seed
         rng = np.random.default_rng(seed)
         self.sensor = ForceSensor(E_SERIES if self.arm.measures_force else CB3_ESTIMATE, rng)
         self.ft300 = ForceSensor(FT300, rng) if ft300 else None
