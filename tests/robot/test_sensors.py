@@ -1,7 +1,5 @@
 """Force sensors: frames, tare, weight, saturation, torn messages."""
 
-import socket
-import threading
 
 import numpy as np
 import pytest
@@ -109,38 +107,6 @@ def test_the_smoothed_wrench_is_late_by_what_it_says():
         now, smooth = chain.wrench(sample, reading_of(np.full(6, slope * sample.clock)))
     late = (now[:3] - smooth[:3]) / np.where(now[:3] == 0, 1, now[:3]) * sample.clock
     assert late == pytest.approx(np.full(3, chain.delay(500.0)))
-
-
-@pytest.mark.parametrize("text, good", [
-    (" 1.0 , 2.0 , -3.5 , 0.1 , 0.2 , 0.3 ", True), ("1,2,3,4,5", False),
-    ("1,2,3,4,5,6,7", False), ("1,2,3,,5,6", False), ("a,b,c,d,e,f", False)])
-def test_torn_messages_are_dropped(text, good):
-    assert (force_samples.parsed_message(text) is not None) == good
-
-
-def test_ft300_messages_in_any_pieces(own_address):
-    """A hundred messages cut at random places; the last whole one is the reading."""
-    sent = [f"( {k} , {-k} , 3.0 , 0.1 , 0.2 , 0.3 )" for k in range(100)]
-    data, rng = "".join(sent).encode(), np.random.default_rng(0)
-    cuts = np.sort(rng.choice(len(data), 60, replace=False))
-    with socket.create_server((own_address, force_samples.FT300_PORT)) as server:
-        cell = Cell(robot={"model": "ur5", "address": own_address}, base={"pose": (0,) * 6},
-                    sensor={"kind": "ft300"})
-        sensor = force_samples.Ft300Sensor(cell)
-        peer, _ = server.accept()
-        sample = sample_at(np.zeros(6))
-        assert np.isnan(sensor.read(sample).wrench).all()
-        with peer:
-            for piece in np.split(np.frombuffer(data, np.uint8), cuts):
-                peer.sendall(piece.tobytes())
-                sensor.read(sample)
-            threading.Event().wait(0.1)
-            reading = sensor.read(sample)
-            assert reading.wrench[:3] == pytest.approx([99, -99, 3]) and reading.age < 0.5
-        threading.Event().wait(0.1)
-        with pytest.raises(ConnectionError):
-            sensor.read(sample)
-        sensor.close()
 
 
 def test_without_a_sensor_nothing_is_moved():

@@ -11,9 +11,10 @@ from tests.robot.conftest import let_go
 
 from limber.core.errors import InputError, WorkError
 from limber.robot.ur import rtde
+from limber.robot.ur.ft300 import STREAM_PORT
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.launch import VirtualRobot
-from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, RtdeClient, Server, answer
+from limber.robot.virtual.server import RTDE_PORT, RtdeClient, Server, answer
 
 
 class Wire(asyncio.Transport):
@@ -205,7 +206,7 @@ def test_watchdog_and_protective_stop_with_the_real_client(e_series):
 
 
 def test_the_ft300_stream_is_what_robotiq_sends(cb3):
-    with socket.create_connection((cb3.address, FT300_PORT), 5.0) as stream:
+    with socket.create_connection((cb3.address, STREAM_PORT), 5.0) as stream:
         cb3.ask("added_wrench", wrench=[0, 0, 40.0, 0, 0, 1.0])
         time.sleep(0.1)
         stream.recv(65536)

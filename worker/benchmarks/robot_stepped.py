@@ -28,19 +28,14 @@ from limber.core.errors import LimberError
 from limber.geometry.rigid_kernels import crossed
 from limber.robot.driver import control_loop, link
 from limber.robot.ur.factory_calibration import PRIMARY_PORT, kinematics_message
+from limber.robot.ur.ft300 import STREAM_PORT
 from limber.robot.ur.rtde import DASHBOARD_PORT, RTDE_PORT
 from limber.robot.virtual.branch_solver import BranchSolver
 from limber.robot.virtual.controller import Controller, RuntimeState
 from limber.robot.virtual.gripped_branch import HeldBranch
 from limber.robot.virtual.launch import ACTIONS, state_of
 from limber.robot.virtual.payload import Load
-from limber.robot.virtual.server import (
-    FT300_PORT,
-    FT300_SECONDS,
-    DashboardClient,
-    RtdeClient,
-    Server,
-)
+from limber.robot.virtual.server import FT300_SECONDS, DashboardClient, RtdeClient, Server
 
 _LATE_STEPS = 2  # until a target that was sent moves the arm
 _ANSWER_SECONDS = 2.0
@@ -231,10 +226,10 @@ class SteppedRobot:
     def connected(self, place: tuple[str, int], timeout: float | None = None) -> "_Socket":
         """Connect to a port, as :func:`socket.create_connection`."""
         address, port = place
-        if address != self.address or (port == FT300_PORT and self.controller.ft300 is None):
+        if address != self.address or (port == STREAM_PORT and self.controller.ft300 is None):
             raise ConnectionRefusedError(f"nobody serves {address} port {port}")
         client = _Socket(self)
-        if port == FT300_PORT:
+        if port == STREAM_PORT:
             self._ft300.append(client)
             self._ft300_due = self.now
         elif port == PRIMARY_PORT and self.controller.calibration is not None:

@@ -1,6 +1,5 @@
 """Forces in the driver's loop: sensors, samples judged by the guard, the motion that these end."""
 
-import re
 import socket
 import time
 from collections import deque
@@ -30,7 +29,7 @@ from limber.robot.interface import (
 )
 from limber.robot.motion.retreat import FollowedPathFile, RetreatPath, read_followed_path
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.ur.ft300_modbus import Ft300Line
+from limber.robot.ur.ft300 import Ft300Line, Ft300Stream
 
 _HELD_UP_SECONDS = 0.02
 _GRACE_SECONDS = 0.015
@@ -203,11 +202,9 @@ class UnderWay:
 # grasp's centre, in the branch's frame. A tare removes bias and weight at its orientation. The
 # change of the gripper's weight with rotation is removed by computation.
 
-FT300_PORT = 63351
 INDEPENDENT_READINGS = 2
 """Least readings in a smoothed wrench: an FT300 sends fewer than a controller requests."""
 
-_MESSAGE = re.compile(r"\(([^()]*)\)")
 
 
 class ForceTorqueSensor(Protocol):
@@ -245,63 +242,24 @@ class ControllerSensor:
 
 
 class Ft300Sensor:
-    """A Robotiq FT300 by the text stream of its URCap: about 100 readings a second. WorkError if
-    the port does not answer."""
-
-    def __init__(self, cell: Cell, timeout: float = 2.0):
-        self._frame = frame_of(np.array(cell.sensor.pose))
-        address = cell.robot.address
-        try:
-            self._socket = socket.create_connection((address, FT300_PORT), timeout)
-        except OSError as error:
-            raise WorkError(f"No FT300 answers at {address} port {FT300_PORT} ({error}).",
-                            "The cell file names it as the force sensor.",
-                            "Check its cable and that its URCap is installed, or name another "
-                            "sensor in the cell file.") from error
-        self._socket.setblocking(False)
-        self.connections: tuple[socket.socket, ...] = (self._socket,)
-        self._text = ""
-        self._last: np.ndarray | None = None
-        self._arrived = time.monotonic()
-
-    def read(self, sample: Sample) -> Reading:
-        try:
-            while chunk := self._socket.recv(65536):
-                self._text += chunk.decode("ascii", "replace")
-            raise ConnectionError("the FT300 closed the connection")
-        except BlockingIOError:
-            pass
-        for message in _MESSAGE.findall(self._text):
-            numbers = parsed_message(message)
-            if numbers is not None:
-                self._last, self._arrived = numbers, time.monotonic()
-        self._text = self._text[self._text.rfind("("):] if "(" in self._text else ""
-        if _MESSAGE.fullmatch(self._text.strip()):
-            self._text = ""
-        age = time.monotonic() - self._arrived
-        wrench = np.full(6, np.nan) if self._last is None else self._last
-        frame = self._frame
-        return Reading(turned_wrench(frame[:3, :3], wrench, frame[:3, 3]), age, wrench)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-class Ft300UsbSensor:
-    """A Robotiq FT300 by Modbus over its USB converter: about 70 readings a second. LimberError as
+    """A Robotiq FT300, by its URCap's stream or by USB. LimberError as :class:`.Ft300Stream`,
     :class:`.Ft300Line`."""
-
-    connections: tuple[socket.socket, ...] = ()
 
     def __init__(self, cell: Cell):
         self._frame = frame_of(np.array(cell.sensor.pose))
-        assert cell.sensor.device is not None
-        self._line = Ft300Line(cell.sensor.device)
+        self.connections: tuple[socket.socket, ...] = ()
+        self._source: Ft300Stream | Ft300Line
+        if cell.sensor.kind == "ft300_usb":
+            assert cell.sensor.device is not None
+            self._source = Ft300Line(cell.sensor.device)
+        else:
+            self._source = Ft300Stream(cell.robot.address)
+            self.connections = (self._source.connection,)
         self._last = np.full(6, np.nan)
         self._arrived = time.monotonic()
 
     def read(self, sample: Sample) -> Reading:
-        found = self._line.poll()
+        found = self._source.poll()
         if found is not None:
             self._last, self._arrived = found, time.monotonic()
         frame = self._frame
@@ -309,7 +267,7 @@ class Ft300UsbSensor:
                        time.monotonic() - self._arrived, self._last)
 
     def close(self) -> None:
-        self._line.close()
+        self._source.close()
 
 
 def open_sensor(cell: Cell, control: ArmControl | None = None) -> ForceTorqueSensor:
@@ -318,11 +276,7 @@ def open_sensor(cell: Cell, control: ArmControl | None = None) -> ForceTorqueSen
     require_sensor(cell)
     if (own := getattr(control, "sensor", None)) is not None:
         return own
-    if cell.sensor.kind == "ft300_usb":
-        return Ft300UsbSensor(cell)
-    if cell.sensor.kind == "ft300":
-        return Ft300Sensor(cell)
-    return ControllerSensor(cell)
+    return ControllerSensor(cell) if cell.sensor.kind == "controller" else Ft300Sensor(cell)
 
 
 @dataclass
@@ -439,17 +393,6 @@ def rehearse(cell: Cell, sample: Sample, reading: Reading) -> None:
     guard.state = State.MOVING
     guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
     pose_of(frame_of(np.array(cell.base.pose)) @ frame_of(sample.pose))
-
-
-def parsed_message(message: str) -> np.ndarray | None:
-    """Return the six numbers of one FT300 message (no brackets), or None if it is incomplete."""
-    parts = message.split(",")
-    if len(parts) != 6:
-        return None
-    try:
-        return np.array([float(part) for part in parts])
-    except ValueError:
-        return None
 
 
 _BATCH_SECONDS = 0.02

@@ -20,6 +20,7 @@ from limber.core.errors import InputError, Option, WorkError
 from limber.geometry.cloud.camera import Camera
 from limber.robot.ur import rtde
 from limber.robot.ur.factory_calibration import PRIMARY_PORT, kinematics_message
+from limber.robot.ur.ft300 import STREAM_PORT
 from limber.robot.ur.grippers import ROBOTIQ_PORT
 from limber.robot.virtual.controller import Controller, RobotMode, RuntimeState, SafetyMode
 
@@ -116,7 +117,7 @@ _ACTIONS = {
 }
 
 
-RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, FT300_PORT = 30004, 30003, 29999, 63351
+RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 MARKER_PORT = 63400
 """Simulated tracking of points on the branch: JSON lines, 30 a second."""
 CAMERA_PORT = 63401
@@ -151,7 +152,7 @@ class Server:
         self.delay = 0.0
         self.silent = False
         self.ft300_fault = ""
-        self._left_out = np.random.default_rng([controller.seed, FT300_PORT])
+        self._left_out = np.random.default_rng([controller.seed, STREAM_PORT])
         self.lost_seconds = 0.0
         self._servers: list[asyncio.Server] = []
         self.transports: set[asyncio.WriteTransport] = set()
@@ -171,7 +172,7 @@ class Server:
         if self.controller.robotiq is not None:
             ports[ROBOTIQ_PORT] = self._serve_robotiq
         if self.controller.ft300 is not None:
-            ports[FT300_PORT] = self._serve_ft300
+            ports[STREAM_PORT] = self._serve_ft300
         if self.controller.load.seen():
             ports[MARKER_PORT] = self._serve_markers
             ports[CAMERA_PORT] = self._serve_camera

@@ -1,12 +1,17 @@
-"""A Robotiq FT300 by Modbus RTU, over its USB converter: readings on request.
+"""A Robotiq FT300: the text stream of its URCap, or Modbus RTU over its USB converter.
 
-19200 baud, 8 data bits, no parity, 1 stop bit, slave 9. Holding registers 180 to 185 are Fx, Fy, Fz
-in hundredths of a newton and Mx, My, Mz in thousandths of a newton metre, signed. Source: Robotiq,
-"FT 300 instruction manual", Modbus RTU communication; Modbus application protocol, function 3. One
-exchange takes 14 ms on the line, so there are about 70 readings a second.
+The stream has about 100 readings a second, ``( Fx , Fy , Fz , Mx , My , Mz )`` in N and N m.
+
+By Modbus readings come on request: 19200 baud, 8 data bits, no parity, 1 stop bit, slave 9. Holding
+registers 180 to 185 are Fx, Fy, Fz in hundredths of a newton and Mx, My, Mz in thousandths of a
+newton metre, signed. Source: Robotiq, "FT 300 instruction manual", Modbus RTU communication; Modbus
+application protocol, function 3. One exchange takes 14 ms on the line, so there are about 70
+readings a second.
 """
 
 import os
+import re
+import socket
 import struct
 import time
 from types import ModuleType
@@ -21,6 +26,53 @@ _HEAD = bytes([SLAVE, READ, 2 * COUNT])
 _LENGTH = len(_HEAD) + 2 * COUNT + 2
 _AGAIN_SECONDS = 0.03  # without an answer
 _OPEN_SECONDS = 1.0
+STREAM_PORT = 63351
+_MESSAGE = re.compile(r"\(([^()]*)\)")
+_LONGEST = 1000  # characters of a message that has begun
+
+
+class Ft300Stream:
+    """The stream of a robot at ``address``. WorkError if its port does not answer."""
+
+    def __init__(self, address: str):
+        try:
+            self.connection = socket.create_connection((address, STREAM_PORT), 2.0)
+        except OSError as error:
+            raise WorkError(f"No FT300 answers at {address} port {STREAM_PORT} ({error}).",
+                            "The cell file names it as the force sensor.",
+                            "Check its cable and that its URCap is installed, or name another "
+                            "sensor in the cell file.") from error
+        self.connection.setblocking(False)
+        self._text = ""
+
+    def poll(self) -> np.ndarray | None:
+        """Return the newest reading that has arrived since the last call, shape [6] in N and N m;
+        ConnectionError if the connection was lost."""
+        try:
+            while chunk := self.connection.recv(65536):
+                self._text += chunk.decode("ascii", "replace")
+            raise ConnectionError("the FT300 closed the connection")
+        except BlockingIOError:
+            pass
+        whole, end, rest = self._text.rpartition(")")
+        self._text = rest[-_LONGEST:]
+        readings = map(parsed_message, _MESSAGE.findall(whole + end))
+        return next((each for each in reversed(list(readings)) if each is not None), None)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.connection.close()
+
+
+def parsed_message(message: str) -> np.ndarray | None:
+    """Return the six numbers of one message (no brackets), or None if it is incomplete."""
+    parts = message.split(",")
+    if len(parts) != 6:
+        return None
+    try:
+        return np.array([float(part) for part in parts])
+    except ValueError:
+        return None
 
 
 def checked(frame: bytes) -> bytes:

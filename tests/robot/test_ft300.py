@@ -1,6 +1,7 @@
-"""An FT300 on a serial line: the bytes of Modbus RTU, from a pseudo-terminal that answers."""
+"""An FT300: its stream's text in any pieces, and Modbus RTU from a pseudo-terminal that answers."""
 
 import os
+import socket
 import struct
 import threading
 import time
@@ -10,9 +11,9 @@ import pytest
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import WorkError
-from limber.robot.driver.force_samples import Ft300UsbSensor
+from limber.robot.driver.force_samples import Ft300Sensor
 from limber.robot.interface import Sample
-from limber.robot.ur.ft300_modbus import REQUEST, Ft300Line, checked
+from limber.robot.ur.ft300 import REQUEST, STREAM_PORT, Ft300Line, checked, parsed_message
 
 pty = pytest.importorskip("pty")
 SAMPLE = Sample(0, 0, np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), 7, 1, 2, 1.0)
@@ -82,7 +83,7 @@ def test_readings_come_in_newtons_and_turn_into_the_flange():
         read_soon(serial)
         assert read_soon(serial) == pytest.approx([1.0, 0, 0, 0, 0, 0])
         serial.close()
-        sensor = Ft300UsbSensor(cell.model_copy(update={"sensor": cell.sensor.model_copy(
+        sensor = Ft300Sensor(cell.model_copy(update={"sensor": cell.sensor.model_copy(
             update={"device": line.device})}))
         while np.isnan((reading := sensor.read(SAMPLE)).raw).any():
             time.sleep(0.001)
@@ -104,3 +105,35 @@ def test_answers_that_are_cut_or_changed_are_no_readings(spoil):
         assert line.requests > 1
     with pytest.raises(WorkError, match="cannot be opened"):
         Ft300Line("/dev/no-such-line")
+
+
+@pytest.mark.parametrize("text, good", [
+    (" 1.0 , 2.0 , -3.5 , 0.1 , 0.2 , 0.3 ", True), ("1,2,3,4,5", False),
+    ("1,2,3,4,5,6,7", False), ("1,2,3,,5,6", False), ("a,b,c,d,e,f", False)])
+def test_torn_messages_are_dropped(text, good):
+    assert (parsed_message(text) is not None) == good
+
+
+def test_ft300_messages_in_any_pieces(own_address):
+    """A hundred messages cut at random places; the last whole one is the reading."""
+    sent = [f"( {k} , {-k} , 3.0 , 0.1 , 0.2 , 0.3 )" for k in range(100)]
+    data, rng = "".join(sent).encode(), np.random.default_rng(0)
+    cuts = np.sort(rng.choice(len(data), 60, replace=False))
+    with socket.create_server((own_address, STREAM_PORT)) as server:
+        cell = Cell(robot={"model": "ur5", "address": own_address}, base={"pose": (0,) * 6},
+                    sensor={"kind": "ft300"})
+        sensor = Ft300Sensor(cell)
+        peer, _ = server.accept()
+        sample = SAMPLE
+        assert np.isnan(sensor.read(sample).wrench).all()
+        with peer:
+            for piece in np.split(np.frombuffer(data, np.uint8), cuts):
+                peer.sendall(piece.tobytes())
+                sensor.read(sample)
+            threading.Event().wait(0.1)
+            reading = sensor.read(sample)
+            assert reading.wrench[:3] == pytest.approx([99, -99, 3]) and reading.age < 0.5
+        threading.Event().wait(0.1)
+        with pytest.raises(ConnectionError):
+            sensor.read(sample)
+        sensor.close()
