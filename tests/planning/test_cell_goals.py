@@ -142,8 +142,7 @@ def test_a_plan_ends_deeper_in_a_region_than_the_field_is_wrong(field):
     away = np.linalg.norm(tips - rest, axis=1)
     goal = Goal(TIP, Ball(tuple(tips[np.argmin(np.abs(away - 0.08))]), 0.03))
     assert goal.excess(field, field.rest[None])[0] > 0.0
-    start = field.rest
-    inner = goal.with_margin(field, field.limited(), start)
+    inner = goal.with_margin(field, field.limited(), field.rest)
     points = goal_points(inner, field, field.limited())
     depth = -goal.region.distance(field.tip(points))
     stated = field.place_errors(None, points, 0.95)
@@ -153,12 +152,10 @@ def test_a_plan_ends_deeper_in_a_region_than_the_field_is_wrong(field):
     # A ball that the tip only touches: nothing is left of it with the whole margin.
     far = tips[np.argmax(tips[:, 0])]
     touched = Goal(TIP, Ball(tuple(far + [0.2998, 0.0, 0.0]), 0.3))
-    assert touched.with_margin(field, field.limited(), start).margin < 1.0
+    assert touched.with_margin(field, field.limited(), field.rest).margin < 1.0
     # A start that is in the goal stays where it is.
     around = Goal(TIP, Ball(tuple(rest), 0.03))
-    assert around.with_margin(field, field.limited(), start) is around
-
-
+    assert around.with_margin(field, field.limited(), field.rest) is around
 
 
 def test_states_of_a_plan_refine_the_border(field, small_model):

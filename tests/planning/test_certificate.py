@@ -35,7 +35,7 @@ def problem_on(field, *, start=START, goal=GOAL, deformation=1.0, **limits):
     weights = CostWeights.between(field, start, goal.centre(field), deformation=deformation,
                                   distance=1.5).weights
     limited = field.limited(**limits)  # the field taken for the branch
-    return GentleProblem(field, limited, weights, start, goal, beyond=limited)
+    return GentleProblem(field, limited, weights, start, goal, sure=limited)
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +308,7 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
     """Analytic gradients agree with central differences, limits broken and goal missed; also with
     multipliers."""
     problem = replace(problem_on(ridge_field), longest=0.1, limits=Limits(
-        energy=0.02, force=0.5).within(ridge_field, 1.0))
+        energy=0.02, force=0.5).on(ridge_field, 1.0))
     path = next(bulges(problem, 1))[::4] * 1.6
     path[-1] += 0.05
     direction = np.random.default_rng(0).normal(size=path.shape)

@@ -52,7 +52,7 @@ def problem_on(field, share):
     weights = CostWeights.between(field, ends[0], ends[1], deformation=1.0, distance=1.5).weights
     limit = share * np.linalg.norm(field.force(ends), axis=1).max()
     limited = field.limited(max_force=limit)
-    return GentleProblem(field, limited, weights, ends[0], goal, beyond=limited)
+    return GentleProblem(field, limited, weights, ends[0], goal, sure=limited)
 
 
 def poses_near_the_floor(field, count):
@@ -133,7 +133,7 @@ def test_no_proof_stands_against_a_path(bowing_field):
     assert not judge(enough).proven
     limited = replace(enough.limits, max_force=0.9 * np.linalg.norm(
         bowing_field.force(enough.start[None])))
-    assert judge(replace(enough, limits=limited, beyond=limited)).proven
+    assert judge(replace(enough, limits=limited, sure=limited)).proven
     assert not judge(replace(enough, limits=limited)).proven, "nothing is known of its error"
 
 

@@ -10,7 +10,7 @@ from limber.core.progress import Progress
 from limber.planning import baseline_and_plan
 from limber.planning.certificate import feasibility
 from limber.planning.certificate.feasibility import judge
-from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.limits import SURELY, Limits
 from limber.planning.cost import CostWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.goals.goal import TIP, Goal, grasp_goal
@@ -55,7 +55,8 @@ def lowest_in_the_wall(field, name):
 def problem_on(field, limits, goal=GOAL):
     weights = CostWeights.between(field, START, GOAL.region.middle, deformation=1.0,
                                   distance=1.5).weights
-    return GentleProblem(field, limits.on(field), weights, START, goal, beyond=limits.beyond(field))
+    surely = limits.on(field, SURELY)
+    return GentleProblem(field, limits.on(field), weights, START, goal, sure=surely)
 
 
 @pytest.mark.parametrize("name", ["strain", "stress", "axial_force", "torque"])
@@ -66,7 +67,7 @@ def test_what_the_field_may_be_wrong_by_is_no_proof(rough_field, name):
     uncertainty = Limits(**{name: lowest}).doubts(rough_field)[name]
     assert 0.5 * ROUGH < uncertainty < 5.0 * ROUGH
     near = problem_on(rough_field, Limits(**{name: lowest - 0.4 * uncertainty}))
-    held_for_true = judge(replace(near, beyond=near.limits))
+    held_for_true = judge(replace(near, sure=near.limits))
     assert held_for_true.proven, "the field alone would have been a proof"
     assert not judge(near).proven
     assert judge(problem_on(rough_field, Limits(**{name: lowest - 1.4 * uncertainty}))).proven
@@ -79,9 +80,9 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
     settings, limits, told, tried = PlanSpec(), Limits(strain=2.4), [], []
     there = baseline_and_plan.plan_pair(rough_field, START, grasp_goal(START, 0.01), settings)
 
-    def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
+    def plan_pair(_field, _start, _goal, _settings, tried_limits, *, sure, **_options):
         tried.append(2.4 - tried_limits.slack.most.sum())
-        assert beyond.max_loads[0] == pytest.approx(2.4 + uncertainty)
+        assert sure.max_loads[0] - sure.slack.most.sum() == pytest.approx(2.4 + uncertainty)
         if tried[-1] <= 2.4:
             raise BlockedError(seen, "On a grid.", "Raise the limit.")
         return there

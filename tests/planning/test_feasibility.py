@@ -49,7 +49,7 @@ def problem_on(field, **limits):
     limited = field.limited(**limits)
     weights = CostWeights.between(field, field.rest, GOAL.centre(field), deformation=1.0,
                                   distance=1.5).weights
-    return GentleProblem(field, limited, weights, field.rest.copy(), GOAL, beyond=limited)
+    return GentleProblem(field, limited, weights, field.rest.copy(), GOAL, sure=limited)
 
 
 @pytest.mark.slow

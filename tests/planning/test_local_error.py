@@ -7,7 +7,7 @@ import pytest
 
 from limber.planning import make_plan
 from limber.planning.certificate.feasibility import judge
-from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.limits import SURELY, Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.radial import LocalError
@@ -67,13 +67,14 @@ def test_cells_close_by_the_error_of_their_place(half_rough):
     weights = CostWeights.between(half_rough, start, goal.region.middle, deformation=1.0,
                                   distance=1.5).weights
     problem = GentleProblem(half_rough, limits.on(half_rough), weights, start, goal,
-                            beyond=limits.beyond(half_rough), errors=limits.errors(half_rough))
-    generator = np.random.default_rng(0)
-    points = half_rough.region.draw(500, generator)
-    spare = problem.spare("strain", points)
+                            sure=limits.on(half_rough, SURELY))
+    points = half_rough.region.draw(500, np.random.default_rng(0))
+    one, = problem.surely_limited()
+    spare = one.largest - one.limit_at(points)
     smooth = points[:, 1] < -0.05
     assert spare[smooth].mean() > 2.0 * spare[points[:, 1] > 0.05].mean() >= 0.0
-    assert (replace(problem, errors={}).spare("strain", points) == 0.0).all()
+    error = limits.errors(half_rough)["strain"].at(half_rough.region.chart.plain.map(points))
+    assert np.allclose(one.limit_at(points), 2.2 + error, rtol=1e-12)
 
 
 def test_a_limit_in_doubt_is_extended_by_the_error_of_its_place(half_rough):
@@ -82,7 +83,7 @@ def test_a_limit_in_doubt_is_extended_by_the_error_of_its_place(half_rough):
     points = half_rough.region.draw(3000, np.random.default_rng(0))
     over = np.abs(half_rough.load(points, "strain")) - 2.2
     error = limits.errors(half_rough)["strain"].at(half_rough.region.chart.plain.map(points))
-    allowed = allowed_points(points, limits.in_doubt(half_rough))
+    allowed = allowed_points(points, limits.on(half_rough, SURELY))
     trusted = half_rough.region.contains(points)
     assert np.array_equal(allowed, trusted & (over <= error))
     assert (allowed & (over > 0.0)).sum() > 20 < (trusted & ~allowed).sum()
@@ -167,11 +168,11 @@ def test_a_plan_keeps_off_a_limit_by_the_error_of_the_place(half_rough):
                           0.3 * 2.2).at(chart.map(points))
     assert np.ptp(error) > 0.1
     for share in (0.0, 0.5, 1.0):
-        allowed = allowed_points(points, limits.within(half_rough, share))
+        allowed = allowed_points(points, limits.on(half_rough, share))
         assert np.array_equal(allowed, strain <= 2.2 - share * error)
     old = replace(half_rough, missed=np.full_like(half_rough.missed, np.nan))
-    assert np.array_equal(allowed_points(points, limits.within(old, 1.0)), strain <= 0.7 * 2.2)
-    force = Limits(force=1.0, energy=0.05).within(half_rough, 1.0)
+    assert np.array_equal(allowed_points(points, limits.on(old, 1.0)), strain <= 0.7 * 2.2)
+    force = Limits(force=1.0, energy=0.05).on(half_rough, 1.0)
     kept = points[allowed_points(points, force)]
     assert len(kept) and np.linalg.norm(half_rough.force(kept), axis=1).max() < 1.0
 
@@ -183,8 +184,7 @@ def test_a_proof_tells_where_the_way_is_closed(half_rough):
     weights = CostWeights.between(half_rough, start, goal.region.middle, deformation=1.0,
                                   distance=1.5).weights
     found = judge(GentleProblem(half_rough, limits.on(half_rough), weights, start, goal,
-                                beyond=limits.beyond(half_rough),
-                                errors=limits.errors(half_rough)))
+                                sure=limits.on(half_rough, SURELY)))
     assert found.proven and len(found.wall) > 20
     assert (np.abs(found.wall[:, 0]) < 0.1).all()
     assert half_rough.load(found.wall, "strain").min() > 1.5
@@ -202,5 +202,5 @@ def test_a_limit_that_a_known_path_keeps_is_never_proven_impossible(planned_bran
     start, end = way.poses[[0, -1], :3]
     goal = grasp_goal(tuple(map(float, end)), 0.005)
     found = judge(GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
-                                beyond=limits.beyond(field), errors=limits.errors(field)), 40_000)
+                                sure=limits.on(field, SURELY)), 40_000)
     assert not found.proven

@@ -1,6 +1,6 @@
 """Two paths to the same goal region on one field: the shortest, and the gentle one."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,10 +12,9 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import judge
 from limber.planning.certificate.lower_bound import ENERGY, ENOUGH, Certificate, certify
-from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.limits import SURELY, Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
-from limber.planning.field.radial import LocalError
 from limber.planning.goals.goal import (
     Goal,
     GoalOverLimitsError,
@@ -319,27 +318,25 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                 before: PathPair | None = None, is_bounded: bool = True,
                 progress: Progress = SILENT) -> PathPair:
     """Plan as :func:`plan_pair` within the field's possible error; else on the field alone; else in
-    doubt (:meth:`~.limits.Limits.in_doubt`). A proof refers to ``asked``, the bound to
+    doubt (:data:`~.limits.SURELY`). A proof refers to ``asked``, the bound to
     ``asked_goal``. ``before`` gives trees and paths to start from."""
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
     closed, is_open = _closed_by_field(field, start, goal, limits, asked or limits)
     none = dict.fromkeys(margins, 0.0)
-    surely = (asked or limits).beyond(field)
-    errors = (asked or limits).errors(field)
-    options: Any = {"errors": errors, "asked_goal": asked_goal, "before": before,
-                    "is_bounded": is_bounded}
+    options: Any = {"sure": (asked or limits).on(field, SURELY), "asked_goal": asked_goal,
+                    "before": before, "is_bounded": is_bounded}
     if closed is not None:
-        return replace(_in_doubt(closed, field, start, goal, settings, limits, surely, **options,
+        return replace(_in_doubt(closed, field, start, goal, settings, limits, **options,
                                  progress=progress), margins=none)
     # A start near its limit leaves room for only a part of the margins.
     shares = [share for share in _SHARES if is_open and any(margins.values())
-              and allowed_points(start[None], limits.within(field, share))[0]]
+              and allowed_points(start[None], limits.on(field, share))[0]]
     if shares:
         part = {name: shares[0] * value for name, value in margins.items()}
         try:
-            found = plan_pair(field, start, goal, settings, limits.within(field, shares[0]),
-                              beyond=surely, **options, progress=progress.part(0.0, 0.5))
+            found = plan_pair(field, start, goal, settings, limits.on(field, shares[0]),
+                              **options, progress=progress.part(0.0, 0.5))
             return replace(found, margins=part)
         except NoPathError as error:
             if isinstance(error, BlockedError) and error.is_proven:
@@ -348,10 +345,10 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                           f"({_margin_text(part)}). The path is planned without margins. The full "
                           "model decides whether it is allowed.")
     try:
-        found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
-                          **options, progress=progress.part(0.5, 1.0))
+        found = plan_pair(field, start, goal, settings, limits.on(field), **options,
+                          progress=progress.part(0.5, 1.0))
     except BlockedError as error:
-        found = _in_doubt(error, field, start, goal, settings, limits, surely, **options,
+        found = _in_doubt(error, field, start, goal, settings, limits, **options,
                           progress=progress.part(0.5, 1.0))
     return replace(found, margins=none)
 
@@ -363,7 +360,7 @@ def _closed_by_field(field: EnergyField, start: np.ndarray, goal: Goal, limits: 
     if not limits.asked():
         return None, True
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
-                            beyond=asked.beyond(field), errors=asked.errors(field))
+                            sure=asked.on(field, SURELY))
     verdict = judge(problem, _FEW_CELLS)
     if not verdict.proven:
         closed = not_found(problem, "By the energy field there is none, but its error leaves the "
@@ -379,8 +376,7 @@ def _closed_by_field(field: EnergyField, start: np.ndarray, goal: Goal, limits: 
 
 
 def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: Goal,
-              settings: PlanSettings, limits: Limits, surely: FieldArrays,
-              **options: Any) -> PathPair:
+              settings: PlanSettings, limits: Limits, **options: Any) -> PathPair:
     """Return the plan with limits relaxed by the field's possible error, without a close bound.
     BlockedError if ``none``, if it is proven, the field has no error, or relaxing does not help."""
     doubts, options = limits.doubts(field), options | {"is_bounded": False}
@@ -391,8 +387,8 @@ def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: G
         f"with limits extended by the field's error, at most {_margin_text(doubts)}. The full "
         "model decides whether it is allowed.")
     try:
-        return replace(plan_pair(field, start, goal, settings, limits.in_doubt(field),
-                                 beyond=surely, **options), in_doubt=none)
+        return replace(plan_pair(field, start, goal, settings, limits.on(field, SURELY),
+                                 **options), in_doubt=none)
     except NoPathError:
         raise none from None
 
@@ -404,8 +400,8 @@ def _margin_text(margins: dict[str, float]) -> str:
 
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
-              limits: FieldArrays | None = None, *, beyond: FieldArrays | None = None,
-              errors: Mapping[str, LocalError] | None = None, asked_goal: Goal | None = None,
+              limits: FieldArrays | None = None, *, sure: FieldArrays | None = None,
+              asked_goal: Goal | None = None,
               before: PathPair | None = None, detour_from_tree: bool = False,
               is_bounded: bool = True, progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits (None: the settings'), and bound any path
@@ -414,7 +410,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     limits = limits or Limits.of(settings).on(field)
     check_start(field, start, limits)
     if goal.excess(field, start[None])[0] <= 0.0:
-        return _staying(field, start, goal, settings, limits, beyond)
+        return _staying(field, start, goal, settings, limits, sure)
     nobody: GoalOverLimitsError | None = None
     try:
         goals = with_near_side(goal_points(goal, field, limits, seed=settings.seed), start, goal,
@@ -426,8 +422,8 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     weighed = CostWeights.between(field, start, goal.centre(field),
                                   deformation=settings.weights[0],
                                   distance=settings.weights[1])
-    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond,
-                            errors=errors or {}, asked_goal=asked_goal)
+    problem = GentleProblem(field, limits, weighed.weights, start, goal, sure=sure,
+                            asked_goal=asked_goal)
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
                    progress.part(0.0, 0.5)) if nobody is None else {}
     try:
@@ -483,12 +479,12 @@ def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPa
 
 
 def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
-             limits: FieldArrays, beyond: FieldArrays | None) -> PathPair:
+             limits: FieldArrays, sure: FieldArrays | None) -> PathPair:
     """Return the plan if the start is in the goal: both paths stay there."""
     weighed = CostWeights.between(field, start, goal.centre(field),
                                   deformation=settings.weights[0],
                                   distance=settings.weights[1])
-    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
+    problem = GentleProblem(field, limits, weighed.weights, start, goal, sure=sure)
     path = FoundPath(np.stack([start, start]), 0.0, 0.0, engine=NOTHING_ASKED)
     return PathPair(path, path, _approach(problem, settings), weighed, Certificate(0.0, 0.0),
                     {"straight line": path.points, "eikonal": path.points})
@@ -574,7 +570,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
                                deformation=settings.weights[0])
     goal = grasp_goal(start, _AT_START)
     path = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), goal,
-                         beyond=problem.beyond, errors=problem.errors)
+                         sure=problem.sure)
     line = np.linspace(field.rest, start, 40)
     points, least = refine(line, path)
     if not np.isfinite(least):

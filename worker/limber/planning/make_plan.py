@@ -18,7 +18,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import PathPair, plan_within, with_bound
 from limber.planning.certificate.lower_bound import ENOUGH
 from limber.planning.constraints.chance import Risk, YoungUncertainty
-from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.limits import SURELY, Limits
 from limber.planning.constraints.motion_check import (
     MotionCheck,
     as_samples,
@@ -184,7 +184,7 @@ def solved_if_undecided(field: EnergyField, grasp_model: GraspModel, start: np.n
     if path is None or path.worst > 1.0 + reserve:
         return None
     if path.worst > 1.0:  # the error there may be less
-        open_way = easiest_path(field, limits.in_doubt(field), start, goal)
+        open_way = easiest_path(field, limits.on(field, SURELY), start, goal)
         if open_way is None or open_way.worst > 1.0:
             return None
     approach = field.rest[None]

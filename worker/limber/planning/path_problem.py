@@ -1,7 +1,7 @@
 """One planning problem: start, goal, cost per metre and limits."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays, Quantity, limited
-from limber.planning.field.radial import LocalError
 from limber.planning.goals.goal import Goal, allowed_points, over_limits, unit_hint
 from limber.planning.settings import PlanSettings
 
@@ -44,8 +43,8 @@ class BlockedError(NoPathError):
 class GentleProblem:
     """Any path from ``start`` into ``goal`` within ``limits`` (see ``EnergyField.limited``). The
     bound is for the whole ``asked_goal``, any length, and every branch whose energy is within
-    ``field_error`` [J] of the field. ``beyond`` (:meth:`~.limits.Limits.beyond`) are limits that
-    prove something; ``errors`` say by limit how much less the field errs at a position."""
+    ``field_error`` [J] of the field. The field exceeds the limits ``sure`` only where the branch
+    exceeds those asked for (:data:`~.limits.SURELY`): they prove something."""
 
     energy_field: EnergyField
     limits: FieldArrays
@@ -54,8 +53,7 @@ class GentleProblem:
     goal: Goal
     field_error: float = 0.0
     longest: float = np.inf
-    beyond: FieldArrays | None = None
-    errors: Mapping[str, LocalError] = field(default_factory=dict)
+    sure: FieldArrays | None = None
     asked_goal: Goal | None = None
 
     @property
@@ -63,25 +61,12 @@ class GentleProblem:
         """The goal to which no path costs less than the bound."""
         return self.asked_goal or self.goal
 
-    def spare(self, name: str, points: np.ndarray) -> np.ndarray:
-        """Return by how much the limit ``beyond`` may be less at ``points`` [n, 3], shape [n]."""
-        error = self.errors.get(name)
-        if error is None or not np.isfinite(error.most):
-            return np.zeros(len(points))
-        return error.most - error.at(self.energy_field.region.chart.plain.map(points))
-
-    @property
-    def sure_limits(self) -> FieldArrays:
-        """The limits ``beyond`` which a pose is surely not allowed; infinite if unknown."""
-        if self.beyond is not None:
-            return self.beyond
-        return replace(self.limits, max_energy=np.inf, max_force=np.inf,
-                       max_loads=np.full_like(self.limits.max_loads, np.inf))
-
-    def sure_quantities(self) -> list[Quantity]:
-        """Return the quantities besides the force, with their :attr:`sure_limits`."""
+    def surely_limited(self) -> list[Quantity]:
+        """Return the quantities with the limits beyond which a pose is ``sure`` not allowed."""
+        if self.sure is None:
+            return []
         return [replace(one, limit=one.limit + self.field_error) if one.name == "energy" else one
-                for one in limited(self.energy_field, self.sure_limits) if one.name != "force"]
+                for one in limited(self.energy_field, self.sure)]
 
     def cost(self, path: np.ndarray) -> float:
         """Return the cost of a polyline [n, 3]; infinite over a limit, too long or off the goal.
@@ -97,7 +82,7 @@ class GentleProblem:
 
     def limits_in_words(self) -> str:
         """Describe the limits that are set, or return an empty string."""
-        return _in_words(self, self.limits)
+        return _in_words((one, one.limit) for one in limited(self.energy_field, self.limits))
 
     def goal_excess(self, point: np.ndarray) -> float:
         """Return how far ``point`` [3] is outside the goal region [m], negative inside."""
@@ -107,20 +92,19 @@ class GentleProblem:
 def least_over(problem: GentleProblem, points: np.ndarray) -> np.ndarray:
     """Return ``points`` [n, 3] in ascending order of their excess over a limit."""
     worst = np.zeros(len(points))
-    for one in limited(problem.energy_field, problem.sure_limits):
-        worst = np.maximum(worst, one.size(points) / one.limit)
+    for one in problem.surely_limited():
+        worst = np.maximum(worst, one.size(points) / one.largest)
     return points[np.argsort(worst, kind="stable")]
 
 
-def _in_words(problem: GentleProblem, limits: FieldArrays) -> str:
-    kept = [f"{one.words} {one.with_unit(one.limit)}"
-            for one in limited(problem.energy_field, limits)]
+def _in_words(limits: Iterable[tuple[Quantity, float]]) -> str:
+    kept = [f"{one.words} {one.with_unit(limit)}" for one, limit in limits]
     return (" at most " + " and ".join(kept)) if kept else ""
 
 
 def no_path_error(problem: GentleProblem, proof: str) -> BlockedError:
     """Return the error for a goal that no path reaches, with the ``proof``."""
-    counted = _in_words(problem, problem.sure_limits)
+    counted = _in_words((one, one.largest) for one in problem.surely_limited())
     if counted:
         proof += (" The proof includes the largest cross-validation error of the energy field: on "
                   f"the field no path keeps{counted} together either.")

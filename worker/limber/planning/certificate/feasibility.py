@@ -49,7 +49,7 @@ def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
     """Return a path on the field, or whether it is proven that none exists; undecided if that would
     take more than ``most_cells`` at once."""
     most = most_cells or _MOST_CELLS
-    exact = replace(problem, beyond=problem.limits, errors={})
+    exact = replace(problem, sure=problem.limits)
     on_field = _judged(exact, most, is_exact=True)
     if not on_field.proven:
         return on_field
@@ -153,25 +153,23 @@ def _surely_over(problem: GentleProblem, cells: Cells, positions: np.ndarray, no
     """Cells in which no point keeps the sure limits, bool [n], and this one's uncertainty by axis
     [n, 3]; ``nodes`` [n, 32] number each cell's ``positions`` [m, 3]."""
     over, uncertainty = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
-    for one in problem.sure_quantities():
+    for one in problem.surely_limited():
+        most = one.limit_at(positions)[nodes[:, AT]].max(axis=1)
+        if one.name == "force":
+            force = problem.energy_field.force(positions)[nodes]
+            bends = _bends(force)
+            over |= off_zero(force[:, AT]) - bends.sum(axis=1) > most
+            # Between corners it may be any value between theirs.
+            corners = force[:, AT].reshape(-1, 2, 2, 2, 3)
+            corners = np.stack([np.linalg.norm(np.diff(corners, axis=axis), axis=-1).max(
+                axis=(1, 2, 3)) for axis in (1, 2, 3)], axis=1)
+            uncertainty = np.maximum(uncertainty, (bends + corners) / one.largest)
+            continue
         values, slopes = one.smooth(positions)
         along = cells.chart.push_forward(positions, slopes) * cells.edges
         least, bends = _least(values[nodes], along[nodes])
-        spare = problem.spare(one.name, positions)[nodes[:, AT]].min(axis=1)
-        most = one.smooth_limit(spare)
-        over |= least > most
-        uncertainty = np.maximum(uncertainty, bends / most[:, None])
-    limit = problem.sure_limits.max_force
-    if limit < np.inf:
-        spare = problem.spare("force", positions)[nodes[:, AT]].min(axis=1)
-        force = problem.energy_field.force(positions)[nodes]
-        bends = _bends(force)
-        over |= off_zero(force[:, AT]) - bends.sum(axis=1) > limit - spare
-        # Between corners it may be any value between theirs.
-        corners = force[:, AT].reshape(-1, 2, 2, 2, 3)
-        corners = np.stack([np.linalg.norm(np.diff(corners, axis=axis), axis=-1).max(axis=(1, 2, 3))
-                            for axis in (1, 2, 3)], axis=1)
-        uncertainty = np.maximum(uncertainty, (bends + corners) / limit)
+        over |= least > one.smooth_limit(most)
+        uncertainty = np.maximum(uncertainty, bends / one.smooth_limit(most)[:, None])
     return over, uncertainty
 
 

@@ -593,21 +593,19 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, corners:
                  energy: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Return those of ``cells`` in which no point keeps the limits, including the field's error;
     ``energy`` [n] and ``force`` [n, 3] at ``corners`` [n, 3]: theirs and those next to them."""
-    limits, over = problem.sure_limits, np.zeros(cells.shape, bool)
-    nodes = np.argwhere(corners_of(cells))
-
-    def spare(name: str) -> np.ndarray:
-        at_nodes = grid.spread(nodes, problem.spare(name, grid.points(nodes)))
-        return np.nan_to_num(corner_values(at_nodes).min(axis=0))
-    for one in problem.sure_quantities():
+    over, nodes = np.zeros(cells.shape, bool), np.argwhere(corners_of(cells))
+    for one in problem.surely_limited():
+        most = np.nan_to_num(corner_values(grid.spread(nodes, one.limit_at(grid.points(
+            nodes)))).max(axis=0), nan=np.inf)
+        if one.name == "force":
+            over |= least_size(grid.spread(corners, force), cells) > most
+            continue
         beside, values, slopes = corners, energy, force
         if one.name != "energy":
             beside = np.argwhere(widened(corners_of(cells)))
             values, slopes = one.smooth(grid.points(beside))
         over |= least_between(grid.spread(beside, values), grid.spread(
-            beside, grid.along_edges(slopes)), cells) > one.smooth_limit(spare(one.name))
-    if limits.max_force < np.inf:
-        over |= least_size(grid.spread(corners, force), cells) > limits.max_force - spare("force")
+            beside, grid.along_edges(slopes)), cells) > one.smooth_limit(most)
     return over
 
 

@@ -23,7 +23,7 @@ from limber.cell.obstacles import Obstacle, closest
 from limber.core.errors import Command, InputError, Option, Text
 from limber.mechanics.materials.materials import strain_limit
 from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
-from limber.planning.field.radial import LocalError, Slack, slack_of
+from limber.planning.field.radial import LocalError, slack_of
 from limber.planning.field.stored_states import States
 from limber.planning.goals.region import empty_along
 from limber.planning.settings import PlanSettings
@@ -122,6 +122,9 @@ _FEWEST = 12  # fewest samples near it; otherwise all are used
 _MOST = 0.3  # fraction of the limit; where the field is worse, the check on the full model decides
 
 
+SURELY = -1.0
+"""The share of :meth:`Limits.on` with which the field exceeds a limit only where the branch does.
+"""
 CONSTRAINTS: list[Callable[[PlanSettings], Constraint | None]] = []
 """Makes external constraints from a plan's settings, or None if none is requested."""
 
@@ -269,22 +272,21 @@ class Limits:
         return self._local(known, 1.0, 1.0, {name: doubts[name] for name in self.asked()
                                              if np.isfinite(doubts[name])})
 
-    def within(self, known: EnergyField, share: float) -> FieldArrays:
-        """Return the field with these limits, tighter at each position by a ``share`` of the
-        field's possible underestimate there, which 95 % of the left-out samples keep."""
-        return self._slackened(known, self._local(known, -1.0, _COVERED, {
-            name: _MOST * limit for name, limit in self.asked().items()}), share)
-
-    def in_doubt(self, known: EnergyField) -> FieldArrays:
-        """Return the field with limits that it may exceed at a position where the branch keeps
-        these: extended by the field's possible overestimate there; infinite if not known."""
-        return self._slackened(known, self.errors(known), -1.0)
-
-    def _slackened(self, known: EnergyField, errors: dict[str, LocalError], share: float,
-                   ) -> FieldArrays:
-        """Return the field with the limits that have errors, tighter by a ``share`` of these."""
-        return self.on(known, {name: -np.inf for name in self.asked() if name not in errors},
-                       slack_of(("energy", "force", *known.load_names), errors, share))
+    def on(self, known: EnergyField, share: float = 0.0) -> FieldArrays:
+        """Return the field with these limits for the kernels. Above 0, they are tighter at each
+        position by a ``share`` of the field's possible underestimate there, which 95 % of the
+        left-out samples keep. Below 0 (:data:`SURELY`), they are looser by the possible
+        overestimate, which none exceeded: infinite where it is not known."""
+        limits, errors = self.asked(), dict[str, LocalError]()
+        if share > 0.0:
+            errors = self._local(known, -1.0, _COVERED, {
+                name: _MOST * limit for name, limit in limits.items()})
+        elif share < 0.0:
+            errors = self.errors(known)
+            limits = {name: limits[name] for name in errors}
+        return known.limited(limits.pop("energy", np.inf), limits.pop("force", np.inf),
+                             low=self.low, high=self.high, slack=slack_of(
+                                 ("energy", "force", *known.load_names), errors, share), **limits)
 
     def _local(self, known: EnergyField, side: float, covered: float, most: dict[str, float],
                ) -> dict[str, LocalError]:
@@ -294,20 +296,6 @@ class Limits:
         mapped = known.region.chart.plain.map(known.samples.positions)[inner]
         return {name: LocalError.of(mapped, side * above[name][inner], covered, limit)
                 for name, limit in most.items()}
-
-    def beyond(self, known: EnergyField) -> FieldArrays:
-        """Return the field with limits that it exceeds only where the branch exceeds these."""
-        return self.on(known, {name: -more for name, more in self.doubts(known).items()})
-
-    def on(self, known: EnergyField, margins: dict[str, float] | None = None,
-           slack: Slack | None = None) -> FieldArrays:
-        """Return the field with these limits for the kernels, tighter by ``margins`` and
-        ``slack``."""
-        less = margins or {}
-        tighter: Any = {name: limit - less.get(name, 0.0)
-                        for name, limit in self.asked().items()}
-        return known.limited(tighter.pop("energy", np.inf), tighter.pop("force", np.inf),
-                             low=self.low, high=self.high, slack=slack, **tighter)
 
     def broken(self, states: States) -> list[Broken]:
         """Return the limits that states of the full model break, each at its worst state."""

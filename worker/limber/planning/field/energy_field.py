@@ -536,6 +536,18 @@ class Quantity:
             size = size + slacks_at(self.field.region.chart.plain.map(points), self.row, self.slack)
         return size / self.limit
 
+    def limit_at(self, points: np.ndarray) -> np.ndarray:
+        """Return the limit less the slack at ``points`` [n, 3], shape [n]."""
+        limits = np.full(len(points), self.limit)
+        if self.slack.factors[self.row]:
+            limits -= slacks_at(self.field.region.chart.plain.map(points), self.row, self.slack)
+        return limits
+
+    @property
+    def largest(self) -> float:
+        """The limit where the slack extends it most."""
+        return self.limit - min(float(self.slack.most[self.row]), 0.0)
+
     def slope(self, points: np.ndarray) -> np.ndarray:
         """Return the gradient of size and slack, shape [n, 3]."""
         field, chart = self.field, self.field.region.chart.plain
@@ -561,9 +573,9 @@ class Quantity:
         load = self.field.load(points, self.name)
         return load**2, 2.0 * load[:, None] * self.field.load_gradient(points, self.name)
 
-    def smooth_limit(self, spare: np.ndarray) -> np.ndarray:
-        """Return the limit of :meth:`smooth` where the quantity's is less by ``spare``."""
-        return self.limit - spare if self.name == "energy" else (self.limit - spare)**2
+    def smooth_limit(self, limits: np.ndarray) -> np.ndarray:
+        """Return the limit of :meth:`smooth` where the quantity's is ``limits``."""
+        return limits if self.name == "energy" else limits**2
 
     def with_unit(self, value: float) -> str:
         """Return a value of it in words."""

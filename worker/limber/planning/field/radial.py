@@ -289,7 +289,7 @@ def slack_of(names: Sequence[str], errors: Mapping[str, LocalError], share: floa
     for row, name in enumerate(names):
         if name in errors:
             factors[row], most[row] = np.inf, share * errors[name].most
-        if name in known and len(known[name].points) == len(points):
+        if name in known and np.array_equal(known[name].points, points):
             squares[row], factors[row] = known[name].squares, share * known[name].factor
     return Slack(np.ascontiguousarray(points), squares, factors, most,
                  1.0 if first is None else first.near)
