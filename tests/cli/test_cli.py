@@ -152,6 +152,7 @@ def test_every_listed_command_exists():
 def test_an_unknown_command_or_option_is_answered_with_those_like_it(capfd):
     """One that is like none points at the list."""
     for arguments, told in ((["recnstruct"], "Did you mean reconstruct?"),
+                            (["new-cel"], "Did you mean robot new-cell?"),
                             (["robot", "chek"], "Did you mean 'check'?"),
                             (["simulate", "x.branch", "--duratoin", "1"], "--duration"),
                             (["xyzzy"], "`limber --help` lists all.")):

@@ -102,8 +102,7 @@ def test_an_arm_that_holds_tells_its_force(choice):
     """Nobody is at a terminal here."""
     found = retreat_if_chosen(cell_with("digital_output"), Link(), choice, SILENT)
     assert found == {"choice": "hold", "retreated": False, "gripper_opened": False, "force_n": 38.0,
-                     "outcome": "The arm holds where it stopped; the force on the branch is 38.0 "
-                                "N."}
+                     "outcome": "The arm holds; the force on the branch is 38.0 N."}
 
 
 def test_what_a_stopped_command_found_is_in_its_json(capfd):

@@ -93,11 +93,15 @@ def test_a_stiffer_branch_is_taken_to_the_goal_by_another_plan(execute):
 
 
 @pytest.mark.slow
-def test_a_goal_beyond_the_limit_is_refused_and_the_arm_holds(execute):
+@pytest.mark.parametrize(("stiffer", "soft", "reason"), [
+    (1.5, 10.0, "the branch is stiffer"), (1.08, 8.2, "soft force limit")])
+def test_a_goal_beyond_the_limit_is_refused_and_the_arm_holds(execute, stiffer, soft, reason):
     """With 1.5 times the modulus the goal takes 12 N: with 10 N allowed none is followed to it."""
-    result, told, robot = execute(1.5, 10.0, replan=2)
-    assert not result["reached"] and result["peak_force_n"] < 10.0
-    assert any("It was not planned anew: " in text and "10 N" in text for text in told), told
+    result, told, robot = execute(stiffer, soft, replan=2)
+    assert not result["reached"] and result["peak_force_n"] < soft and reason in result[
+        "stop_reason"]
+    assert any("It was not planned anew: " in text and f"{soft:g} N" in text
+               for text in told), told
     assert result["after_stop"]["choice"] == "hold" and "replans" not in result
     assert robot.state["branch"] == "held" and np.linalg.norm(robot.state["tool_speed"]) < 1e-3
 

@@ -33,7 +33,8 @@ class _Commands(click.Group):
         name = args[0]
         if name not in command_summaries() and not name.startswith("-"):
             # Loads no package: it is the first thing that a new user runs.
-            close = difflib.get_close_matches(name, command_summaries(), 2)
+            known = {each.split()[-1]: each for each in (*command_summaries(), *command_names())}
+            close = [known[each] for each in difflib.get_close_matches(name, known, 2)]
             ctx.fail(f"There is no command '{name}'. " + (
                 f"Did you mean {' or '.join(close)}?" if close else "`limber --help` lists all."))
         return super().resolve_command(ctx, args)

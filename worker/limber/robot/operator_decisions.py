@@ -52,8 +52,7 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
     decision: dict[str, Any] = {"choice": "hold", "retreated": False, "gripper_opened": False}
     if choice != "retreat":
         decision |= {"force_n": _force_left(link)}
-        return decision | {"outcome":
-                           f"The arm holds where it stopped; {_left(decision['force_n'])}."}
+        return decision | {"outcome": f"The arm holds; {_left(decision['force_n'])}."}
     if not link.has_ended:
         found = _gone_back(cell, link, progress)
         if found["retreated"] or not link.has_ended:
