@@ -66,15 +66,14 @@ def speed_within(cell: Cell, speed: float, warn: Callable[[str], None] | None = 
     return min(speed, most)
 
 
-# The wrench that a model expects along a path: its value, slope and uncertainty.
-#
-# A branch is stiff along its axis: a tenth of a millimetre of the gripper's position is newtons
-# there. So the expected wrench is that at the gripper's *actual* position: the wrench at the
-# planned pose plus the tangent stiffness times the displacement from there. Errors of that
-# displacement (the arm's own repeatability, a base that is rotated against its calibration) times
-# the stiffness are errors of the wrench. The covariance states them, and the guard and the report
-# allow for it. What is off by the same all along the path (the base, how the branch lies in the
-# jaws) stands by itself: it is one unknown, not one at each place.
+# The wrench that a model expects along a path: its value, slope and uncertainty. A branch is stiff
+# along its axis: a tenth of a millimetre of the gripper's position is newtons there. So the
+# expected wrench is that at the gripper's *actual* position: the wrench at the planned pose plus
+# the tangent stiffness times the displacement from there. Errors of that displacement (the arm's
+# own repeatability, a base that is rotated against its calibration) times the stiffness are errors
+# of the wrench. The covariance states them, and the guard and the report allow for it. What is off
+# by the same all along the path (the base, how the branch lies in the jaws) stands by itself: it is
+# one unknown, not one at each place.
 
 LAID_M = 2e-4
 """Deviation of where a branch lies in the jaws: bark gives way, and readings are a little old."""
@@ -100,10 +99,10 @@ class ExpectedWrench:
         return cls(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6)),
                    poses[0], np.zeros((count, 3, 6)))
 
-    def reversed(self) -> "ExpectedWrench":
-        """Return the same in reverse order."""
-        return ExpectedWrench(self.wrenches[::-1], self.slopes[::-1], self.covariance[::-1],
-                              self.rest_pose, self.places[::-1])
+    def rows(self, chosen: slice) -> "ExpectedWrench":
+        """Return the same at some rows."""
+        return ExpectedWrench(self.wrenches[chosen], self.slopes[chosen], self.covariance[chosen],
+                              self.rest_pose, self.places[chosen])
 
     def at(self, k: int, part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return wrench [6], slopes [6, 6], covariance [6, 6] and places [3, 6] between rows k and
@@ -129,10 +128,9 @@ class Predicted:
     def of_forces(cls, poses: np.ndarray, forces: np.ndarray, torques: np.ndarray | None = None,
                   ) -> "Predicted":
         """Return a prediction from forces and torques [n, 3] at poses [n, 6] alone."""
-        count = len(poses)
-        torques = np.zeros((count, 3)) if torques is None else torques
-        return cls(poses, np.hstack([forces, torques]), np.zeros((count, 6, 6)),
-                   np.zeros((count, 3, 3)))
+        torques = np.zeros((len(poses), 3)) if torques is None else torques
+        return cls(poses, np.hstack([forces, torques]), np.zeros((len(poses), 6, 6)),
+                   np.zeros((len(poses), 3, 3)))
 
     def first(self, count: int) -> "Predicted":
         """Return the prediction at the first ``count`` poses alone."""
@@ -254,16 +252,16 @@ class Trajectory:
 
     def backwards(self) -> "Trajectory":
         """Return it from its end to its start, at the same speed, with its expected wrench."""
-        return Trajectory(self.duration - self.times[::-1], self.poses[::-1],
-                          None if self.expected is None else self.expected.reversed(),
-                          None if self.joints is None else self.joints[::-1], self.by_joints)
+        return self._rows(slice(None, None, -1), self.duration - self.times[::-1])
 
     def since(self, row: int, times: np.ndarray) -> "Trajectory":
         """Return it from a ``row`` on at ``times`` [n - row] [s]."""
-        felt = self.expected
-        return Trajectory(times, self.poses[row:], None if felt is None else ExpectedWrench(
-            felt.wrenches[row:], felt.slopes[row:], felt.covariance[row:], felt.rest_pose,
-            felt.places[row:]), None if self.joints is None else self.joints[row:], self.by_joints)
+        return self._rows(slice(row, None), times)
+
+    def _rows(self, chosen: slice, times: np.ndarray) -> "Trajectory":
+        return Trajectory(times, self.poses[chosen],
+                          None if self.expected is None else self.expected.rows(chosen),
+                          None if self.joints is None else self.joints[chosen], self.by_joints)
 
     def _segment_at(self, time: float) -> tuple[int, float]:
         time = min(max(time, 0.0), self.duration)
@@ -279,15 +277,7 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
     angles = np.arccos(np.clip((np.einsum("nij,nij->n", turns[1:], turns[:-1]) - 1) / 2, -1, 1))
     steps = np.maximum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1),
                        angles * speed / turn_speed)
-    steps = np.maximum(steps, 1e-9)
-    arc = np.r_[0.0, np.cumsum(steps)]
-    bound = np.minimum(speed, np.sqrt(2 * acceleration * np.minimum(arc, arc[-1] - arc)))
-    if len(steps) == 1:
-        # It begins and ends at rest, so it must not be passed at zero speed.
-        durations = np.maximum(2 * np.sqrt(steps / acceleration), 2 * steps / speed)
-    else:
-        durations = 2 * steps / np.maximum(bound[1:] + bound[:-1], 1e-6)
-    return np.r_[0.0, np.cumsum(durations)]
+    return along_bounded(steps, np.full(len(poses), speed), acceleration)
 
 
 def along_bounded(steps: np.ndarray, speeds: np.ndarray, acceleration: float) -> np.ndarray:
@@ -301,7 +291,8 @@ def along_bounded(steps: np.ndarray, speeds: np.ndarray, acceleration: float) ->
         bound[k] = min(bound[k], np.sqrt(bound[k + 1]**2 + 2 * acceleration * steps[k]))
     # A single step begins and ends at rest, so it must not be passed at zero speed.
     durations = np.where(bound[1:] + bound[:-1] > 0, 2 * steps / np.maximum(
-        bound[1:] + bound[:-1], 1e-9), 2 * np.sqrt(steps / acceleration))
+        bound[1:] + bound[:-1], 1e-9), np.maximum(2 * np.sqrt(steps / acceleration),
+                                                  2 * steps / np.max(speeds)))
     return np.r_[0.0, np.cumsum(durations)]
 
 

@@ -1,12 +1,10 @@
 """A Robotiq FT300: the text stream of its URCap, or Modbus RTU over its USB converter.
 
-The stream has about 100 readings a second, ``( Fx , Fy , Fz , Mx , My , Mz )`` in N and N m.
-
-By Modbus readings come on request: 19200 baud, 8 data bits, no parity, 1 stop bit, slave 9. Holding
-registers 180 to 185 are Fx, Fy, Fz in hundredths of a newton and Mx, My, Mz in thousandths of a
-newton metre, signed. Source: Robotiq, "FT 300 instruction manual", Modbus RTU communication; Modbus
-application protocol, function 3. One exchange takes 14 ms on the line, so there are about 70
-readings a second.
+The stream has about 100 readings a second, ``( Fx , Fy , Fz , Mx , My , Mz )`` in N and N m. By
+Modbus readings come on request, about 70 a second: 19200 baud, 8 data bits, no parity, 1 stop bit,
+slave 9. Holding registers 180 to 185 are Fx, Fy, Fz in hundredths of a newton and Mx, My, Mz in
+thousandths of a newton metre, signed. Source: Robotiq, "FT 300 instruction manual", Modbus RTU
+communication; Modbus application protocol, function 3.
 """
 
 import os

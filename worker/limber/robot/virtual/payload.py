@@ -19,8 +19,7 @@ class SensorTraits:
 
     Attributes:
         force_sigma, torque_sigma: White noise of a sample [N], [N m].
-        force_bias, torque_bias: Reading without load, each axis at random [N], [N
-            m].
+        force_bias, torque_bias: Reading without load, each axis at random [N], [N m].
         gain_sigma: Relative standard deviation of the sensor's gain, one for all readings.
         drift_n_per_minute: Drift of the force along z.
         force_range, torque_range: Saturation of a reading [N], [N m].
