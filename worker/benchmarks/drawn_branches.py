@@ -22,13 +22,12 @@ from limber.estimation.estimate_file import details, summary
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import Estimate, judge_model, require_result
-from limber.estimation.fitting.objective import EvaluationLog, Objective
+from limber.estimation.fitting.objective import EvaluationLog, Objective, inverse_information
 from limber.estimation.forward.observed_path import MotionWanted, moved, seen_at
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values, open_field
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import CellErrors, marked_points
-from limber.estimation.uncertainty.covariance import inverse_information
 from limber.estimation.uncertainty.model_error import total_interval
 from limber.geometry.skeleton.skeleton import control_points
 from limber.geometry.tets.tet_mesh import TetMesh

@@ -48,7 +48,8 @@ directions.
 SCANS = (("one-sided", 1e-3), ("round", 1e-3), ("one-sided", 2e-3), ("round", 2e-3))
 """View and noise [m] in turn."""
 YOUNG_PA = (3e5, 1e10)
-"""Mean modulus of a branch, least and most. One that cannot be pulled is made threefold stiffer."""
+"""Mean modulus of a branch, least and most. One that cannot stand as it was scanned, or cannot be
+pulled, is made threefold stiffer."""
 ZERO_N, ZERO_SHARE = 1.0, 0.05
 """Deviation of the force's zero, and of its drift: of the peak force if that is less, as a sensor
 is chosen for the branch.
@@ -195,7 +196,7 @@ def _looped(folder: Path, case: ScanCase, rng: np.random.Generator) -> dict[str,
 
 def _pulled(mesh: TetMesh, axes: Skeleton, gravity: tuple[float, float, float],
             rng: np.random.Generator) -> tuple[TrueBranch, Pull]:
-    """A branch with drawn moduli that bears a pull as a rod, and that pull."""
+    """A branch with drawn moduli that stands and bears a pull as a rod, and that pull."""
     drawn = np.exp(rng.uniform(*np.log(YOUNG_PA)) + np.linspace(0.4, -0.4, len(FRACTIONS))
                    + rng.uniform(-0.5, 0.5, len(FRACTIONS)))
     settings = PullSpec(model="rod", position_noise=0.0, force_noise=0.0, frames=60, reach=0.3,
@@ -203,11 +204,13 @@ def _pulled(mesh: TetMesh, axes: Skeleton, gravity: tuple[float, float, float],
     while True:
         truth = TrueBranch(mesh, axes, control_points(axes), FRACTIONS, drawn, gravity)
         try:
-            return truth, simulate_pull(truth, "pull-1", settings)[0]
+            pull = simulate_pull(truth, "pull-1", settings)[0]
+            if not pull.entry.weightless:
+                return truth, pull
         except WorkError:
             if drawn.max() > YOUNG_PA[1]:
                 raise
-            drawn = 3 * drawn
+        drawn = 3 * drawn
 
 
 def _imported(folder: Path, pull: Pull, branch: Path) -> None:

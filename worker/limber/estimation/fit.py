@@ -455,8 +455,7 @@ def equal_fractions(count: int) -> tuple[float, ...]:
 
 
 def supported(found: Estimate) -> Support:
-    """Return as many control points as the pulls support, by a fit with those at ``FRACTIONS``.
-    InputError if it has no derivatives, or its field no bumps."""
+    """Return as many control points as the pulls support, by a fit with those at ``FRACTIONS``."""
     problem = _Problem.of(found)
     parts = {count: problem.posterior(equal_fractions(count)) for count in range(1, MOST + 1)}
     evidence = {count: part[0] for count, part in parts.items()}
@@ -481,11 +480,7 @@ class _Problem:
     @classmethod
     def of(cls, found: Estimate) -> "_Problem":
         evaluation, space = found.fit.evaluation, found.objective.space
-        field = getattr(found.objective.forwards[0], "field", None)
-        if evaluation.jacobian is None or field is None or field.straight is None:
-            raise InputError("The evidence of control points needs derivatives and an open field.",
-                             "Only a Gauss-Newton fit with the full model has both.",
-                             "Give the control points (", Option("fractions"), ").")
+        field = found.objective.forwards[0].field
         noise = evaluation.mean_square * repeated(found.objective.standardised(evaluation))
         residual, slopes = (scaled_rows(rows, space.own_row_count, noise) for rows in (
             evaluation.residual[:, None], evaluation.slopes))

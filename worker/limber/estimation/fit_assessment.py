@@ -258,11 +258,12 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
 
 def hold_out(found: Estimate, progress: Progress) -> None:
     """Score the prediction of each pull by a fit without it, into ``found.held_out``."""
-    for index, forward in enumerate(found.objective.forwards):
-        rest = without(found.objective, index)
+    objective = found.objective.on_copies()
+    for index, forward in enumerate(objective.forwards):
+        rest = without(objective, index)
         try:
             fit = gauss_newton(rest, found.fit.evaluation.free, evaluation_limit=15)
-            distance, force = held_out(found.objective, fit.evaluation.free, index)
+            distance, force = held_out(objective, fit.evaluation.free, index)
         except WorkError as error:
             progress.warn(str(error))
             continue

@@ -62,6 +62,7 @@ from limber.recordings.recording_formats import (
 from limber.recordings.sensor_checks import clean, force_unit_suspicion
 from limber.recordings.slips import (
     Cantilever,
+    faint_force,
     require_bent_as_pulled,
     require_followed,
     require_no_slip,
@@ -243,7 +244,8 @@ def _moved_by_robot(found: Recorded | Pull, request: ImportRequest) -> dict[str,
     if skeleton is not None and frame is None:
         _require_there(pull, request)
         young = require_bent_as_pulled(pull, skeleton, request.frames)
-        if young is not None and (suspicion := force_unit_suspicion(young)):
+        suspicion = faint_force(pull) if young is None else force_unit_suspicion(young)
+        if suspicion:
             request.progress.warn(suspicion)
     cleaned = clean(pull)
     _tell(request, cleaned.warnings)

@@ -188,7 +188,10 @@ def _with_right_sign(pull: Pull) -> Pull:
         return pull
     work = work_done(replace(pull, wrenches=pull.wrenches - np.nan_to_num(first[:1])))
     most, least = work.max(), work.min()
-    noise = pull.entry.sensor.force_sigma_n * np.sqrt(np.sum(np.diff(pull.poses[:, :3], axis=0)**2))
+    ways = pull.poses[:, :3] - pull.poses[0, :3]
+    # The noise of each reading, and that of the first one over the whole way.
+    noise = pull.entry.sensor.force_sigma_n * np.hypot(
+        np.linalg.norm(np.diff(ways, axis=0)), np.linalg.norm(ways, axis=1).max())
     if -least <= 3 * most or -least <= 3 * noise:
         return pull
     seen = (f"{pull.name}: according to the measured force, the branch did {-least:.3g} J of work "

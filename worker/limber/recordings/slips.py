@@ -218,16 +218,30 @@ def _blocks(pull: Pull) -> tuple[np.ndarray, np.ndarray, int]:
             max(len(rows) // 60, 1))
 
 
+def _change(wrenches: np.ndarray) -> float:
+    return float(np.linalg.norm(wrenches[:, :3] - wrenches[0, :3], axis=1).max(initial=0.0))
+
+
+def faint_force(pull: Pull) -> str | None:
+    """A sentence if the force changes too little against its noise to have a direction."""
+    _, wrenches, count = _blocks(pull)
+    noise = pull.entry.sensor.force_sigma_n
+    if not len(wrenches) or _change(wrenches) >= _NOISES * noise / count**0.5:
+        return None
+    return (f"{pull.name}: the force changes by {_change(wrenches):.2g} N, with a noise of "
+            f"{noise:.2g} N. That does not tell whether its frame and sign are right. Pull "
+            "farther, or use a finer sensor.")
+
+
 def explained_forces(pull: Pull, beam: Cantilever, known: Frames) -> dict[str, _Explained]:
     """How each frame of the force explains the gripper's motion; empty if the force has no
     direction."""
-    poses, wrenches, count = _blocks(pull)
-    if len(poses) < 6 or pull.entry.motion != "quasi_static":
+    poses, wrenches, _ = _blocks(pull)
+    if len(poses) < 6 or pull.entry.motion != "quasi_static" or faint_force(pull):
         return {}
     positions = poses[:, :3]
-    change = np.linalg.norm(wrenches[:, :3] - wrenches[0, :3], axis=1).max()
-    if (change < _NOISES * pull.entry.sensor.force_sigma_n / count**0.5
-            or np.linalg.norm(np.ptp(positions, axis=0)) < 5e-3):
+    change = _change(wrenches)
+    if np.linalg.norm(np.ptp(positions, axis=0)) < 5e-3:
         return {}
     rest = (beam.grasp - beam.middles)[None]
     levers = positions[:, None] - (beam.middles + beam.bent(positions)[1])

@@ -248,13 +248,14 @@ class Evaluation:
     @property
     def deviations(self) -> np.ndarray:
         """Standard deviation of each free value from these derivatives, shape [p]."""
-        return deviations_by(self.slopes)
+        return np.sqrt(np.diag(inverse_information(self.slopes)))
 
 
-def deviations_by(slopes: np.ndarray) -> np.ndarray:
-    """Standard deviations [p] from slopes [r, p] of residuals of unit variance."""
+def inverse_information(slopes: np.ndarray) -> np.ndarray:
+    """Covariance of the free vector from slopes [r, p] of residuals of unit variance, [p, p]."""
     _, values, rows = np.linalg.svd(slopes, full_matrices=False)
-    return np.linalg.norm(rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300)), axis=1)
+    spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
+    return spread @ spread.T
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ Branches that did not fold needed at most 12 until the force had settled, 4 in o
 folding ones hundreds. So a simulation that fails costs about as much as three that do not.
 """
 FEW_KEYS = 4
-"""Simulated frames for the difference of two pulls: with 4, 6 and 12, moduli agreed to 1.5 %."""
+"""Frames that show the difference of two pulls: with 4, 6 and 12, moduli agreed to 1.5 %."""
 YOUNG_STEP_LIMIT = 0.7
 """Largest change of a log E for which a state is extrapolated by its derivative; chosen."""
 

@@ -8,7 +8,7 @@ from typing_extensions import TypedDict
 
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.nuisances import OTHER_CAUSES, advice_on
-from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.objective import Evaluation, Objective, inverse_information
 from limber.estimation.fitting.optimise import OUTLYING, Fit
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, YoungField
 from limber.estimation.uncertainty.drift import scale_steps
@@ -84,13 +84,6 @@ def scaled_rows(rows: np.ndarray, own_row_count: int, scale: float) -> np.ndarra
     scaled, count = rows.copy(), len(rows) - own_row_count
     scaled[:count] /= np.sqrt(max(scale, 1e-300))
     return scaled
-
-
-def inverse_information(slopes: np.ndarray) -> np.ndarray:
-    """Covariance of the free vector from slopes [r, p] of residuals of unit variance, [p, p]."""
-    _, values, rows = np.linalg.svd(slopes, full_matrices=False)
-    spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
-    return spread @ spread.T
 
 
 def recording_spread(evaluation: Evaluation, objective: Objective, scale: float) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import InputError, Option
-from limber.estimation.fitting.objective import Evaluation, Objective, deviations_by
+from limber.estimation.fitting.objective import Evaluation, Objective, inverse_information
 from limber.estimation.parameters import ParameterSpace
 from limber.recordings.recording import calibration_of
 
@@ -128,7 +128,7 @@ def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
     messages = []
     while len(links) < space.group_count - 1:
         own = space.linked(tuple(links)).link_rows()
-        deviations = deviations_by(np.vstack([rows, own]))[:space.group_count]
+        deviations = np.diag(inverse_information(np.vstack([rows, own])))[:space.group_count]**0.5
         open_ones = deviations.copy()
         open_ones[[group for group, _ in links]] = 0.0
         worst = int(np.argmax(open_ones))

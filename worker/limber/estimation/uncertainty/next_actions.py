@@ -17,14 +17,13 @@ from typing_extensions import TypedDict
 from limber.core.errors import Command, Option, Text
 from limber.core.not_none import present
 from limber.estimation.fitting.nuisances import REGISTER, Action
-from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.objective import Evaluation, Objective, inverse_information
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 from limber.estimation.uncertainty.covariance import (
     InformationRows,
     Uncertainty,
     information_rows,
-    inverse_information,
     scaled_rows,
 )
 from limber.estimation.uncertainty.model_error import ModelError, path_slopes, total_interval

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from scipy import sparse
 
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fitting.objective import Evaluation, Objective
-from limber.estimation.forward.forward_model import Simulated
-from limber.estimation.forward.solved_pull import QuasiStaticForward
+from limber.estimation.forward.forward_model import Simulated, key_frames
+from limber.estimation.forward.solved_pull import FEW_KEYS, QuasiStaticForward
 from limber.estimation.parameters import Values
 from limber.estimation.uncertainty.model_error import WIDEST
 from limber.geometry.shape_samples import reshaped, sample_skeletons
@@ -53,21 +53,39 @@ response of a branch turned by a radian to the whole change of a radius is far f
 
 def compensation(evaluation: Evaluation, objective: Objective,
                  slopes: Callable[[QuasiStaticForward, Values], Simulated]) -> np.ndarray | None:
-    """Return the change of log E [K, S] by which a fit compensates S changes, -(J^T J)^-1 J^T dr at
-    few key frames: it varies slowly. None if a pull is dynamic or has no equilibrium."""
-    if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
-        return None
-    forwards = [forward.with_prescribed_poses(forward.frames.poses) for forward
-                in objective.forwards]
-    alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
-    expected = alone.evaluate(evaluation.free, jacobian=True)
-    if expected is None:
+    """Return the change of log E [K, S] by which a fit compensates S changes, -(J^T J)^-1 J^T dr,
+    at the states where it ended. None if a pull is dynamic or on a reduced model."""
+    forwards = _slow(objective)
+    if len(forwards) < len(objective.forwards):
         return None
     values = objective.space.unpack(evaluation.free)
-    changes = alone.residual_slopes(expected, [
-        slopes(forward, values) for forward in forwards if isinstance(forward, QuasiStaticForward)])
-    steps = np.linalg.lstsq(expected.slopes, -changes, rcond=1e-9)[0]
+    changes, known = (objective.residual_slopes(evaluation, each) for each in (
+        [slopes(forward, values) for forward in forwards],
+        # As much is shown of these, or what is not would be taken for the change.
+        [_as_shown(forward, pull) for forward, pull in zip(
+            forwards, evaluation.pulls, strict=True)]))
+    by_free = objective.on_free(known)
+    rows, _ = objective.space.own_rows()
+    by_free[len(by_free) - len(rows):] = rows
+    steps = np.linalg.lstsq(by_free, -changes, rcond=1e-9)[0]
     return steps[list(objective.space.groups)]
+
+
+def _slow(objective: Objective) -> list[QuasiStaticForward]:
+    return [each for each in objective.forwards if isinstance(each, QuasiStaticForward)]
+
+
+def _shown(forward: QuasiStaticForward) -> tuple[np.ndarray, np.ndarray]:
+    """Few of a pull's key frames [k], and S [f, k] with values at all frames = S @ those there."""
+    keys, spread = key_frames(np.arange(float(forward.key_count)), FEW_KEYS)
+    return keys, forward.spread @ spread
+
+
+def _as_shown(forward: QuasiStaticForward, pull: Simulated) -> Simulated:
+    """A pull's derivatives by its few key frames."""
+    keys, spread = _shown(forward)
+    return present(pull.slopes, "derivatives").each(
+        lambda at_frames: np.tensordot(spread, at_frames[forward.keys[keys]], axes=1))
 
 
 def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[TetMesh],
@@ -75,36 +93,23 @@ def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[T
     """Return the change of a pull, last simulated for ``values``, by each of S shapes of its
     mesh."""
     nodes = forward.mesh.nodes
-    operator = point_operator(forward.mesh, forward.rest_points)
-    return _slopes(forward, values,
-                   [forward.aside(nodes + STEP * (mesh.nodes - nodes)) for mesh in meshes],
-                   [point_operator(mesh, forward.rest_points) - operator for mesh in meshes])
-
-
-def hung_slopes(forward: QuasiStaticForward, values: Values) -> Simulated:
-    """Return the change of a pull's observations by the relative mass of the added masses.
-    Arguments as for :func:`shape_slopes`."""
-    size = 3 * len(forward.rest_points), forward.mesh.nodes.size
-    return _slopes(forward, values, [forward.with_hung_mass(1 + STEP)], [sparse.csr_matrix(size)])
-
-
-def grip_slopes(forward: QuasiStaticForward, values: Values) -> Simulated:
-    """Return the change of a pull's observations by the deviation of the length in its gripper.
-    Arguments as for :func:`shape_slopes`."""
-    size = 3 * len(forward.rest_points), forward.mesh.nodes.size
-    longer = STEP * calibration_of(forward.entry).held_length_sigma_m
-    return _slopes(forward, values, [forward.with_longer_grip(longer)], [sparse.csr_matrix(size)])
+    return _slopes(forward, values, [
+        forward.aside(nodes + STEP * (mesh.nodes - nodes)) for mesh in meshes])
 
 
 def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiStaticForward],
-            elsewhere: Sequence[sparse.csr_matrix]) -> Simulated:
+            ) -> Simulated:
     """Changes of pulls by a step; the points may then be elsewhere in the mesh."""
     here = _Pulled(forward, forward.model_with(values))
     equations = here.model.equations((forward.grasp,) if here.is_held else ())
     operator = point_operator(here.model.mesh, forward.rest_points)
     others = [_Pulled(aside, aside.model_with(values)) for aside in asides]
+    elsewhere = [(point_operator(aside.mesh, forward.rest_points) - operator) / STEP
+                 for aside in asides]
     changes = []
-    for key, state in enumerate(forward.displacements()):
+    shown, spread = _shown(forward)
+    for key in shown:
+        state = forward.states()[key].displacement
         before = here.out_of_balance(key, state)
         seen = here.seen(key, state, before)
         tangent = equations.exact_tangent(here.model, state)
@@ -115,7 +120,7 @@ def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiS
             changes.append([points.reshape(-1, 3), *(
                 (now - then) / STEP for now, then in zip(after, seen, strict=True))])
     return Simulated(*(
-        np.einsum("fk,ks...->f...s", forward.spread, np.array(each).reshape(
+        np.einsum("fk,ks...->f...s", spread, np.array(each).reshape(
             -1, len(others), *each[0].shape)) for each in zip(*changes, strict=True)))
 
 
@@ -186,7 +191,15 @@ def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
                and calibration_of(forward.entry).held_length_sigma_m > 0
                for forward in objective.forwards):
         return None
-    steps = compensation(evaluation, objective, grip_slopes)
+    return _error_of(evaluation, objective, lambda forward: forward.with_longer_grip(
+        STEP * calibration_of(forward.entry).held_length_sigma_m))
+
+
+def _error_of(evaluation: Evaluation, objective: Objective,
+              aside: Callable[[QuasiStaticForward], QuasiStaticForward]) -> np.ndarray | None:
+    """Relative deviation of E [K] from one unknown, whose step each pull has in the other one."""
+    steps = compensation(evaluation, objective, lambda forward, values: _slopes(
+        forward, values, [aside(forward)]))
     return None if steps is None else np.minimum(np.abs(steps[:, 0]), WIDEST)
 
 
@@ -237,8 +250,7 @@ class SectionMean:
 def strain_energy(objective: Objective, values: Values) -> np.ndarray | None:
     """Strain energy [tet_count] [J] summed over the frames simulated for ``values``; None if a pull
     is dynamic."""
-    forwards = [forward for forward in objective.forwards
-                if isinstance(forward, QuasiStaticForward)]
+    forwards = _slow(objective)
     if len(forwards) < len(objective.forwards):
         return None
     energies = [forward.model_with(values).internal(state).tet_energy for forward in forwards
@@ -288,12 +300,11 @@ def _towards(skeleton: Skeleton, shape: Skeleton) -> Skeleton:
 def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:
     """Return the relative deviation of E [K] from that of twigs and leaves outside the mesh,
     ``sigma``. None if nothing hangs or there is no gravity, or as :func:`compensation`."""
-    models = [forward.model for forward in objective.forwards
-              if isinstance(forward, QuasiStaticForward)]
+    models = [forward.model for forward in _slow(objective)]
     # Stated masses are known; those of twigs and leaves come from their volume.
     if not sigma or not any(
             model.gravity.any() and any(isinstance(one, HungTwig) for one in model.point_masses)
             for model in models):
         return None
-    steps = compensation(evaluation, objective, hung_slopes)
-    return None if steps is None else np.minimum(sigma * np.abs(steps[:, 0]), WIDEST)
+    return _error_of(evaluation, objective,
+                     lambda forward: forward.with_hung_mass(1 + sigma * STEP))
