@@ -23,10 +23,9 @@ from benchmarks.worlds.sources import LEFT_OUT, branch_case
 from limber.core.errors import LimberError, WorkError
 from limber.core.progress import Progress
 from limber.estimation.estimated_branch import forwards_of, parameter_space, subject_of
-from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.objective import Objective, inverse_information
 from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import CellErrors, TrueBranch, simulate_pull
-from limber.estimation.uncertainty.covariance import inverse_information
 from limber.estimation.uncertainty.shape_error import SectionMean
 from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
