@@ -341,11 +341,10 @@ def test_wrong_sign_is_turned(plain_pull):
 
 def test_a_noisy_first_reading_is_no_sign(plain_pull):
     """All others are then below it, as if a small force pulled back all the way."""
-    sigma = plain_pull.entry.sensor.force_sigma_n
     way = plain_pull.poses[-1, :3] - plain_pull.poses[0, :3]
     wrenches = np.zeros_like(plain_pull.wrenches)
-    wrenches[0, :3] = 2 * sigma * way / np.linalg.norm(way)
-    assert not clean(replace(plain_pull, wrenches=wrenches)).warnings
+    wrenches[0, :3] = 2 * plain_pull.entry.sensor.force_sigma_n * way / np.linalg.norm(way)
+    assert not clean(with_force(plain_pull, wrenches)).warnings
 
 
 def test_sign_is_only_questioned_under_gravity(plain_pull):

@@ -59,10 +59,9 @@ from limber.recordings.recording_formats import (
     RecordingFormat,
     recording_format,
 )
-from limber.recordings.sensor_checks import clean, force_unit_suspicion
+from limber.recordings.sensor_checks import clean
 from limber.recordings.slips import (
     Cantilever,
-    faint_force,
     require_bent_as_pulled,
     require_followed,
     require_no_slip,
@@ -243,8 +242,7 @@ def _moved_by_robot(found: Recorded | Pull, request: ImportRequest) -> dict[str,
     young = None
     if skeleton is not None and frame is None:
         _require_there(pull, request)
-        young = require_bent_as_pulled(pull, skeleton, request.frames)
-        suspicion = faint_force(pull) if young is None else force_unit_suspicion(young)
+        young, suspicion = require_bent_as_pulled(pull, skeleton, request.frames)
         if suspicion:
             request.progress.warn(suspicion)
     cleaned = clean(pull)

@@ -28,10 +28,8 @@ def clean(pull: Pull) -> Pull:
         InputError: a position, force or torque is beyond any plausible value.
     """
     _require_possible(pull)
-    pull = _without_bad_readings(pull)
-    pull = _tared(pull)
-    pull = _with_right_sign(pull)
-    pull = _with_gaps_named(pull)
+    for check in (_without_bad_readings, _tared, _with_right_sign, _with_gaps_named):
+        pull = check(pull)
     if pull.observations is not None:
         observations, swaps = unswapped(pull.observations)
         pull = replace(pull, observations=observations)
@@ -130,11 +128,10 @@ def _better_order(predicted: np.ndarray, now: np.ndarray) -> np.ndarray | None:
 
 def _without_bad_readings(pull: Pull) -> Pull:
     wrench = pull.wrenches.copy()
-    measured = np.isfinite(wrench[:, :3]).all(axis=1)
-    if measured.sum() < 5:
+    rows = np.flatnonzero(np.isfinite(wrench[:, :3]).all(axis=1))
+    if len(rows) < 5:
         return pull
     messages = []
-    rows = np.flatnonzero(measured)
     limited = rows[saturated(wrench[rows, :3])]
     if pull.entry.sensor.force_range_n is not None:
         beyond = np.any(np.abs(wrench[:, :3]) >= pull.entry.sensor.force_range_n, axis=1)
@@ -160,14 +157,11 @@ def _tared(pull: Pull) -> Pull:
         # The hand carries weight at rest, or never moves: the zero of the force is undetermined.
         return pull
     at_rest = np.cumprod(travel <= 0.01 * travel.max()).astype(bool)
-    quiet = pull.wrenches[at_rest]
     # A gauge measures no torque.
-    quiet = quiet[np.isfinite(quiet[:, :3]).all(axis=1)]
-    starts_at_rest = np.linalg.norm(pull.poses[0, :3] - pull.entry.grasp.point_m) <= 2e-3
-    if not len(quiet) or not starts_at_rest:
+    quiet = pull.wrenches[at_rest & np.isfinite(pull.wrenches[:, :3]).all(axis=1)]
+    if not len(quiet) or np.linalg.norm(pull.poses[0, :3] - pull.entry.grasp.point_m) > 2e-3:
         return pull
-    offset = np.median(quiet, axis=0)
-    sigma = pull.entry.sensor.force_sigma_n
+    offset, sigma = np.median(quiet, axis=0), pull.entry.sensor.force_sigma_n
     peak = np.nanmax(np.linalg.norm(pull.wrenches[:, :3], axis=1))
     bias = np.linalg.norm(offset[:3])
     # Five standard deviations of the mean, and more than a few percent of the measured value.
@@ -179,19 +173,16 @@ def _tared(pull: Pull) -> Pull:
 
 
 def _with_right_sign(pull: Pull) -> Pull:
-    if not np.isfinite(pull.wrenches).any() or not pull.entry.sensor.tared:
-        # Without a zero, the work is unknown.
-        return pull
     # By the change of the force: its zero may not be that of a recording that begins bent.
     first = pull.wrenches[np.isfinite(pull.wrenches[:, :3]).all(axis=1)]
-    if not len(first):
+    if not len(first) or not pull.entry.sensor.tared:
+        # Without a zero, the work is unknown.
         return pull
     work = work_done(replace(pull, wrenches=pull.wrenches - np.nan_to_num(first[:1])))
     most, least = work.max(), work.min()
-    ways = pull.poses[:, :3] - pull.poses[0, :3]
     # The noise of each reading, and that of the first one over the whole way.
-    noise = pull.entry.sensor.force_sigma_n * np.hypot(
-        np.linalg.norm(np.diff(ways, axis=0)), np.linalg.norm(ways, axis=1).max())
+    noise = pull.entry.sensor.force_sigma_n * np.hypot(*map(np.linalg.norm, (
+        np.diff(pull.poses[:, :3], axis=0), np.ptp(pull.poses[:, :3], axis=0))))
     if -least <= 3 * most or -least <= 3 * noise:
         return pull
     seen = (f"{pull.name}: according to the measured force, the branch did {-least:.3g} J of work "
@@ -210,9 +201,9 @@ def _with_gaps_named(pull: Pull) -> Pull:
     for name, times in clocks.items():
         found = gaps(times)
         if len(found):
-            longest = np.max(found[:, 1] - found[:, 0])
             messages.append(f"{pull.name}: there are {len(found)} gap(s) in the {name}, the "
-                            f"longest {longest:.2f} s. Values are not interpolated across gaps.")
+                            f"longest {np.ptp(found, axis=1).max():.2f} s. Values are not "
+                            "interpolated across gaps.")
     return pull.warned(*messages)
 
 

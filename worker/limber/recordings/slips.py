@@ -19,6 +19,7 @@ from limber.core.not_none import present
 from limber.core.numerics.rigid import rotation_matrix, rotation_vector
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.recording import Pull, calibration_of
+from limber.recordings.sensor_checks import force_unit_suspicion
 
 _FASTEST_M_S, _LONGEST_S = 5.0, 3600.0
 """Of a robot's tool; of a pull."""
@@ -35,8 +36,8 @@ _MUCH_BETTER, _AS_WELL = 12.0, 6.0
 """Differences of chi-squared from which a frame is named, and up to which another fits as well."""
 _FOLLOWS = 0.5
 """Fraction of its misfit that points have left with another offset of the clocks that is named."""
-_NOISES = 5.0
-"""Noises of the force that its change must exceed to have a direction."""
+_NOISES = 8.0
+"""Noises of the force that its change must exceed to have a direction; noise alone reaches six."""
 _LEAST_PIECES = 24
 """Pieces of the beam."""
 AS_POSES = "poses"
@@ -208,41 +209,25 @@ class _Explained:
     young: float | None = None
 
 
-def _blocks(pull: Pull) -> tuple[np.ndarray, np.ndarray, int]:
-    """Poses and median wrenches of some 60 parts of a pull [n, 6], and the readings in each."""
+def _blocks(pull: Pull) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Poses and median wrenches of some 60 parts of a pull [n, 6]; the force's change over them,
+    and its noise there [N]."""
     rows = np.flatnonzero(np.isfinite(pull.wrenches[:, :3]).all(axis=1)
                           & np.isfinite(pull.poses).all(axis=1))
     parts = [part for part in np.array_split(rows, 60) if len(part)]
-    return (np.array([pull.poses[part[len(part) // 2]] for part in parts]),
-            np.array([np.median(np.nan_to_num(pull.wrenches[part]), axis=0) for part in parts]),
-            max(len(rows) // 60, 1))
-
-
-def _change(wrenches: np.ndarray) -> float:
-    return float(np.linalg.norm(wrenches[:, :3] - wrenches[0, :3], axis=1).max(initial=0.0))
-
-
-def faint_force(pull: Pull) -> str | None:
-    """A sentence if the force changes too little against its noise to have a direction."""
-    _, wrenches, count = _blocks(pull)
-    noise = pull.entry.sensor.force_sigma_n
-    if not len(wrenches) or _change(wrenches) >= _NOISES * noise / count**0.5:
-        return None
-    return (f"{pull.name}: the force changes by {_change(wrenches):.2g} N, with a noise of "
-            f"{noise:.2g} N. That does not tell whether its frame and sign are right. Pull "
-            "farther, or use a finer sensor.")
+    wrenches = np.array([np.median(np.nan_to_num(pull.wrenches[part]), axis=0) for part in parts])
+    return (np.array([pull.poses[part[len(part) // 2]] for part in parts]), wrenches,
+            max((np.linalg.norm((each - wrenches[0])[:3]) for each in wrenches), default=0.0),
+            pull.entry.sensor.force_sigma_n / max(len(rows) // 60, 1)**0.5)
 
 
 def explained_forces(pull: Pull, beam: Cantilever, known: Frames) -> dict[str, _Explained]:
-    """How each frame of the force explains the gripper's motion; empty if the force has no
-    direction."""
-    poses, wrenches, _ = _blocks(pull)
-    if len(poses) < 6 or pull.entry.motion != "quasi_static" or faint_force(pull):
+    """How each frame of the force explains the gripper's motion; empty if there is none."""
+    poses, wrenches, change, _ = _blocks(pull)
+    if (len(poses) < 6 or pull.entry.motion != "quasi_static"
+            or np.linalg.norm(np.ptp(poses[:, :3], axis=0)) < 5e-3):
         return {}
     positions = poses[:, :3]
-    change = _change(wrenches)
-    if np.linalg.norm(np.ptp(positions, axis=0)) < 5e-3:
-        return {}
     rest = (beam.grasp - beam.middles)[None]
     levers = positions[:, None] - (beam.middles + beam.bent(positions)[1])
     by_force, by_torque = beam.responses(levers, (levers + rest) / 2)
@@ -321,13 +306,21 @@ def better_frames(found: dict[str, _Explained]) -> list[str]:
     return [frame for frame in order if found[frame].chi_squared < best + _AS_WELL]
 
 
-def require_bent_as_pulled(pull: Pull, skeleton: Skeleton, known: Frames) -> float | None:
-    """Return the modulus [Pa] that force and motion imply, if they have a direction. InputError,
-    with the likely frames, if another explains force or rotations much better."""
+def require_bent_as_pulled(pull: Pull, skeleton: Skeleton, known: Frames,
+                           ) -> tuple[float | None, str | None]:
+    """Return the modulus [Pa] that force and motion imply, if they have a direction; and a warning
+    if it is no plant's, or the force too small. InputError, with the likely frames, if another
+    explains force or rotations much better."""
     beam = Cantilever.of(skeleton, np.array(pull.entry.grasp.point_m))
     if beam is None:
-        return None
+        return None, None
     _require_radians(pull, beam)
+    poses, _, change, noise = _blocks(pull)
+    if len(poses) and change < _NOISES * noise:
+        return None, (
+            f"{pull.name}: the force changes by {change:.2g} N, with a noise of {noise:.2g} N. "
+            "That does not tell whether its frame and sign are right. Pull farther, or use a finer "
+            "sensor.")
     found = explained_forces(pull, beam, known)
     others = better_frames(found)
     # A force with the opposite sign is found by its work.
@@ -341,7 +334,8 @@ def require_bent_as_pulled(pull: Pull, skeleton: Skeleton, known: Frames) -> flo
             Text.joined(" or ", [Option("force_frame", frame) for frame in others[:4]]),
             " would fit. If the frame is right, state ", Option("force_frame", AS_POSES),
             ", and check the grasp point and the sensor's drift.")
-    return found[AS_POSES].young if found and not others else None
+    young = found[AS_POSES].young if found and not others else None
+    return young, None if young is None else force_unit_suspicion(young)
 
 
 def require_followed(pull: Pull, skeleton: Skeleton, known: Frames, *, is_placed: bool = False,
