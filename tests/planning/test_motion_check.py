@@ -149,17 +149,18 @@ def test_a_plan_to_a_region_ends_less_deep_once_the_field_knows_its_end(to_regio
     cancelled, the one before is kept."""
     again = to_region()
     assert len(again.summary["rounds"]) == 2
-    tried = planning._Rounds._tried
+    tried, left = planning._Rounds._tried, []
 
     def ends_with(error):
         def fails(self, *arguments, **options):
             if self.holding is not None:
+                left.append(self.aim.margin)
                 raise error("No path.", "", "")
             return tried(self, *arguments, **options)
         monkeypatch.setattr(planning._Rounds, "_tried", fails)
         return to_region()
     deep, cancelled = ends_with(NoPathError), ends_with(Cancelled)
-    assert len(deep.summary["rounds"]) == 1
+    assert len(deep.summary["rounds"]) == 1 and left == [planning._KNOWN] * 2
     assert again.summary["certificate"]["upper_bound"] < (
         0.995 * deep.summary["certificate"]["upper_bound"])
     middle = again.summary["goal"]["position_m"]

@@ -48,9 +48,7 @@ CHAPTERS = {
         "must still hold the truth in 95 % of the cases.")),
     "planning": ("Energy, force and paths", (
         "The energy field on poses that it has not seen, the paths against an independent "
-        "optimum, the limits on the full model, and the certified bound. The rows of goals and "
-        "of the paper's arcs are of 27 November 2026, seed 3701, with fields that the full model "
-        "sampled alone. The others are of the run below.")),
+        "optimum, the limits on the full model, and the certified bound.")),
     "robot": ("The robot", (
         "The real client library against the controller in software. No real robot was used.")),
     "worker": ("What a newcomer meets", (

@@ -227,6 +227,7 @@ is larger, the states found join the field, and planning is repeated."""
 _REPLANS = 3  # of the same plan at most: each takes as long as the first
 _SLOWINGS = 4  # of the motion at most, until it keeps the limits
 _LAST, _LAST_EVERY = 4, 2  # states at a path's end that become samples; every second one
+_KNOWN = 0.1  # of the margin in the goal, where the states at a plan's end are samples
 _RESERVE = 1.01  # factor on the tightening of limits: the risk changes a little with the path
 
 
@@ -383,6 +384,7 @@ class _Rounds:
         self.holding = {"pair": pair, "plan": plan, "moving": self.moving, "risks": self.risks[:]}
         states = plan.solved.take(np.arange(len(plan.solved.poses))[::-_LAST_EVERY][:_LAST])
         self.field = refit(self.field, as_samples(self.grasp_model, states, self.limits))
+        self.aim = replace(self.aim, margin=_KNOWN * self.aim.margin)
         return True
 
     def _planned(self, ahead: Progress, is_last: bool) -> PathPair | None:

@@ -366,7 +366,7 @@ def certify_all(problems: Sequence[GentleProblem], improve: Sequence[Improve], *
             progress(level / _LEVELS, "bounding the best path", lower=searches[0].lower,
                      upper=searches[0].upper)
             following = _next_grid([one for one in searches if not one.is_done], *following,
-                                   is_first=level == 0)
+                                   is_first=level == 0, is_last=level == _LEVELS - 1)
     except (Cancelled, KeyboardInterrupt) as stop:
         if not all(one.levels and one.upper < np.inf for one in searches):
             raise Cancelled from stop
@@ -376,7 +376,7 @@ def certify_all(problems: Sequence[GentleProblem], improve: Sequence[Improve], *
 
 
 def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_first: bool,
-               ) -> tuple[Grid, np.ndarray] | None:
+               is_last: bool) -> tuple[Grid, np.ndarray] | None:
     """Bound on a grid; return the next one, None if a finer grid is not worth its time."""
     keep, near = np.zeros(grid.open_cells.shape, bool), grid.about_goal
     common, ratios = COARSEST, np.ones(3)
@@ -388,7 +388,7 @@ def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_fi
         except NoPathError as separated:
             return _unbounded(searches, grid, cell, separated, is_first=is_first)
         one.take(found, grid, is_first=is_first)
-        if not one.is_done:
+        if not one.is_done and not is_last:  # the cells to keep take half as long as the bound
             own, near = found.keep(one.upper), found.about_goal
             common = min(common, one.ratio())
             ratios = np.minimum(ratios, _ratios(found.rates, own, one.ratio()))
