@@ -304,7 +304,7 @@ _MOST_CELLS = 400_000  # in any grid's tube; a further refinement is skipped
 _LEVELS = 6
 _RESERVE = 0.8  # fraction of the edge that would suffice
 _FLATTEST = 4.0  # largest ratio of a cell's edges
-ENOUGH = 0.015  # gap below which refinement is not worth its time
+ENOUGH = 0.0115  # gap below which refinement is not worth its time
 _NEAR = np.ones((3, 3, 3))
 COST, ENERGY = "cost", "energy_integral_jm"
 """Quantity that a certificate bounds: the planner's cost, or the integral of energy [J m]."""
