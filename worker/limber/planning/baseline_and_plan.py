@@ -401,9 +401,9 @@ def _margin_text(margins: dict[str, float]) -> str:
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
               limits: FieldArrays | None = None, *, sure: FieldArrays | None = None,
-              asked_goal: Goal | None = None,
-              before: PathPair | None = None, detour_from_tree: bool = False,
-              is_bounded: bool = True, progress: Progress = SILENT) -> PathPair:
+              asked_goal: Goal | None = None, before: PathPair | None = None,
+              detour_from_tree: bool = False, is_bounded: bool = True,
+              progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits (None: the settings'), and bound any path
     (:class:`~.path_problem.GentleProblem`). The largest detour counts from the shortest path, or
     RRT*'s as in the paper. InputError if the start is not allowed, NoPathError if none."""
@@ -419,9 +419,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         # Drawn poses miss a narrow valley: cells find a path into it, or prove that there is none.
         goals, nobody = np.empty((0, 3)), error
     # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
-    weighed = CostWeights.between(field, start, goal.centre(field),
-                                  deformation=settings.weights[0],
-                                  distance=settings.weights[1])
+    weighed = CostWeights.between(field, start, goal.centre(field), *settings.weights)
     problem = GentleProblem(field, limits, weighed.weights, start, goal, sure=sure,
                             asked_goal=asked_goal)
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
@@ -481,9 +479,7 @@ def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPa
 def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
              limits: FieldArrays, sure: FieldArrays | None) -> PathPair:
     """Return the plan if the start is in the goal: both paths stay there."""
-    weighed = CostWeights.between(field, start, goal.centre(field),
-                                  deformation=settings.weights[0],
-                                  distance=settings.weights[1])
+    weighed = CostWeights.between(field, start, goal.centre(field), *settings.weights)
     problem = GentleProblem(field, limits, weighed.weights, start, goal, sure=sure)
     path = FoundPath(np.stack([start, start]), 0.0, 0.0, engine=NOTHING_ASKED)
     return PathPair(path, path, _approach(problem, settings), weighed, Certificate(0.0, 0.0),
@@ -566,8 +562,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     field, start = problem.energy_field, problem.start
     if np.linalg.norm(start - field.rest) < STEP:
         return field.rest[None]
-    cost = CostWeights.between(field, field.rest, start, distance=settings.weights[1],
-                               deformation=settings.weights[0])
+    cost = CostWeights.between(field, field.rest, start, *settings.weights)
     goal = grasp_goal(start, _AT_START)
     path = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), goal,
                          sure=problem.sure)

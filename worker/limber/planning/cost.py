@@ -43,8 +43,8 @@ class CostWeights:
     length_scale: float
 
     @classmethod
-    def between(cls, field: EnergyField, start: np.ndarray, goal: np.ndarray, *,
-                deformation: float, distance: float) -> "CostWeights":
+    def between(cls, field: EnergyField, start: np.ndarray, goal: np.ndarray, deformation: float,
+                distance: float) -> "CostWeights":
         """Scale to the straight line from ``start`` to ``goal`` [3]."""
         line = resample(np.stack([start, goal]), STEP)
         line = line[field.region.contains(line)]
