@@ -5,6 +5,11 @@ they are open. If open cells do not connect the start's cell to one that may con
 of the goal, no path exists. If cells that keep all limits at their corners do, a path usually
 exists.
 
+The bound has a grid of its own (:mod:`limber.planning.certificate.lower_bound`). Its splines want
+cells that are straight and not too flat; these follow the curved surface, thirty times as long
+along it as off it. For four limits of force about the least on an arc of 0.6 m, 22,000 nodes here
+showed the path, and 1.4 million corners of the bound's grid did not.
+
 Values and slopes at a cell's corners bound the limited quantity from below in the cell
 (:mod:`limber.planning.certificate.subsolution`). This holds for the field. The branch itself may
 keep a limit where the field does not. For a proof a cell is therefore closed only where the field
