@@ -25,7 +25,7 @@ def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
     """A part that is measured again makes no case again."""
     made = []
 
-    def scored(task: tuple[str, int], out: object) -> dict:
+    def scored(task: tuple[str, int]) -> dict:
         made.append(task)
         return _SCORES | ({"main_axis_radii": np.inf} if task[1] % 2 else {})
     monkeypatch.setattr(scan_scores, "scored_case", scored)
@@ -55,8 +55,7 @@ def test_a_root_counts_if_it_is_right_or_asked(monkeypatch, tmp_path) -> None:
 
 def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:
     """Neither a refusal nor a crash ends the bench: the row is not met, and says so."""
-    monkeypatch.setattr(scan_scores, "run_case", lambda case, folder: (
-        (dict(_SCORES), None) if case.seed % 2 else 1 / 0))
+    monkeypatch.setattr(scan_scores, "_scored", lambda one, _: _SCORES | {"n": 1 / (one.seed % 2)})
     monkeypatch.setattr("benchmarks.trials.core_budget", lambda: 1)
     setting = Setting(3, True, Budget(60.0), SILENT, tmp_path)
     found = scan_scores.outcomes(setting, {"gaps": 2})["gaps"]

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.real_scans import DEGRADED, beyond_ends
 from benchmarks.scan_scores import Outcomes
-from benchmarks.scans import potted_rows, source_rows
+from benchmarks.scans import source_rows
 from benchmarks.trials import Trial
 from benchmarks.worlds.plants import Plant, pipe_radii
 from benchmarks.worlds.sensors import cast
@@ -106,9 +106,6 @@ def test_a_row_is_met_only_if_all_of_it_is() -> None:
     assert met([_GOOD, _GOOD | {"covered": 0.4}]) is False
     assert met([_GOOD] * 3, ("refused",)) is False
     assert met([_GOOD | {"twig_false_m": 0.2}]) is False
-    named, = potted_rows([_outcomes([], "a stake at (0, 0, 0)")])
-    unnamed, = potted_rows([_outcomes([], "46 % are leaves")])
-    assert named.met is True and unnamed.met is False
 
 
 def test_only_what_goes_on_beyond_anothers_ends_is_told_apart() -> None:

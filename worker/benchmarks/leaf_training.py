@@ -3,13 +3,12 @@
 ``python -m benchmarks.leaf_training --out DIR`` makes scans of each kind, in leaf and bare, keeps
 their features in DIR (a stopped run continues), writes the trees of
 :mod:`limber.geometry.cloud.leaves`, trained on all sources but those left out, and prints which
-leaves are found in these. With ``--in-turn`` it writes nothing, but leaves out each pair of sources
-in turn. It needs scikit-learn, which Limber itself does not; with 1.9 and no options it makes the
-trees of this version, to the byte.
+leaves are found in these. With other sources left out than Limber's it writes nothing. It needs
+scikit-learn, which Limber itself does not; with 1.9 and no options it makes the trees of this
+version, to the byte.
 """
 
 import argparse
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,8 +30,8 @@ _KINDS = (*(f"{source}:leafy" for source in SOURCES), "leafy",
           *(f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES), "crowns", "2-mm")
 _TREES, _LEAVES, _RATE, _LEAST = 50, 20, 0.2, 50  # number, ends, learning rate, points of an end
 _MOST = 1500  # points of a scan that are learnt from
-_PAIRS = (("weber-penn", "dichotomous"), ("colonisation", "monopodial"), ("sympodial", "opposite"))
-"""Sources left out together; the first pair is unknown to the trees of Limber."""
+LEFT_OUT = ("weber-penn", "dichotomous")
+"""Sources that the odds of Limber do not know."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,7 @@ class Labelled:
     points: np.ndarray
     features: np.ndarray
     leaf: np.ndarray
-
-    @property
-    def source(self) -> str:
-        return self.kind.split(":")[0] if ":" in self.kind else OWN
+    source: str
 
 
 def labelled(kind: str, seed: int, out: Path) -> Labelled:
@@ -65,7 +61,8 @@ def labelled(kind: str, seed: int, out: Path) -> Labelled:
         np.savez_compressed(file, points=points, leaf=leaf, features=surroundings(
             own.coordinates, point_spacing(own.coordinates)))
     with np.load(file) as kept:
-        return Labelled(kind, kept["points"], kept["features"], kept["leaf"])
+        return Labelled(kind, kept["points"], kept["features"], kept["leaf"],
+                        kind.split(":", maxsplit=1)[0] if ":" in kind else OWN)
 
 
 def trained(scans: list[Labelled]) -> Any:
@@ -85,23 +82,16 @@ def trained(scans: list[Labelled]) -> Any:
 
 def exported(model: Any) -> dict[str, np.ndarray]:
     """The trees as arrays, which :mod:`limber.geometry.cloud.leaves` reads."""
-    columns: dict[str, list] = {name: [] for name in ("feature", "threshold", "low", "high",
-                                                      "value")}
-    first, depth, begin = [], [], 0
-    for stage in model._predictors:
-        nodes = stage[0].nodes
-        own, end = np.arange(len(nodes)), nodes["is_leaf"].astype(bool)
-        columns["feature"].append(np.where(end, 0, nodes["feature_idx"]).astype(np.int16))
-        columns["threshold"].append(nodes["num_threshold"].astype(np.float32))
-        columns["low"].append(np.where(end, own, nodes["left"]).astype(np.int16))
-        columns["high"].append(np.where(end, own, nodes["right"]).astype(np.int16))
-        columns["value"].append(nodes["value"].astype(np.float32))
-        first.append(begin)
-        depth.append(int(nodes["depth"].max()))
-        begin += len(nodes)
-    return {name: np.concatenate(parts) for name, parts in columns.items()} | {
-        "first": np.array(first), "depth": np.array(depth),
-        "start": np.float64(_prior(model))}
+    stages = [stage[0].nodes for stage in model._predictors]
+    nodes, counts = np.concatenate(stages), np.array(list(map(len, stages)))
+    own, end = np.concatenate(list(map(np.arange, counts))), nodes["is_leaf"].astype(bool)
+    return {"feature": np.where(end, 0, nodes["feature_idx"]).astype(np.int16),
+            "threshold": nodes["num_threshold"].astype(np.float32),
+            "low": np.where(end, own, nodes["left"]).astype(np.int16),
+            "high": np.where(end, own, nodes["right"]).astype(np.int16),
+            "value": nodes["value"].astype(np.float32), "first": np.cumsum(counts) - counts,
+            "depth": np.array([int(stage["depth"].max()) for stage in stages]),
+            "start": np.float64(_prior(model))}
 
 
 def _prior(model: Any) -> float:
@@ -118,27 +108,24 @@ def tell(scan: Labelled, model: Any) -> None:
           f"{found[~scan.leaf].mean():.1%} of the wood's taken", flush=True)
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None) -> None:
     """Make scans, train, write the trees, and measure them on the sources left out."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--first", type=int, default=9100, help="first seed of each kind")
     parser.add_argument("--count", type=int, default=3, help="seeds of each kind")
     parser.add_argument("--out", type=Path, required=True, help="folder for the features")
-    parser.add_argument("--left-out", nargs="+", default=_PAIRS[0])
-    parser.add_argument("--in-turn", action="store_true", help="leave out each pair; write nothing")
+    parser.add_argument("--left-out", nargs="+", default=LEFT_OUT)
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     scans = [labelled(kind, seed, options.out) for kind in _KINDS
              for seed in range(options.first, options.first + options.count)]
-    for left_out in _PAIRS if options.in_turn else [options.left_out]:
-        model = trained([scan for scan in scans if scan.source not in left_out])
-        if not options.in_turn:
-            np.savez_compressed(TREES, **exported(model))
-        for scan in scans:
-            if scan.source in left_out:
-                tell(scan, model)
-    return 0
+    model = trained([scan for scan in scans if scan.source not in options.left_out])
+    if tuple(options.left_out) == LEFT_OUT:
+        np.savez_compressed(TREES, **exported(model))
+    for scan in scans:
+        if scan.source in options.left_out:
+            tell(scan, model)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

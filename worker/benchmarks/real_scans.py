@@ -12,12 +12,13 @@ from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial.transform import Rotation
 
 from benchmarks.scan_cases import one_sided_case, round_case
-from benchmarks.scan_pictures import draw
 from benchmarks.scan_scores import Dense, explained
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import Trial, sound
@@ -110,18 +111,20 @@ def reference_length(name: str) -> float | None:
 # --- changes ----------------------------------------------------------------------------------
 
 
-def _half(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
-    chosen = np.sort(rng.permutation(len(cloud))[:len(cloud) // 2])
-    return Cloud(cloud.points[chosen]), settings, unmoved
+def _of_points(change: Callable) -> Callable:
+    """A change of the points alone."""
+    return lambda cloud, settings, rng: (Cloud(change(cloud.points, rng)), settings, unmoved)
+
+
+def _half(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return points[np.sort(rng.permutation(len(points))[:len(points) // 2])]
 
 
 def _turned(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
     """About the vertical."""
     up = np.array(settings.get("up", (0.0, 0.0, 1.0)))
-    up = up / np.linalg.norm(up)
-    angle = rng.uniform(0, 2 * np.pi)
-    cross = np.array([[0, -up[2], up[1]], [up[2], 0, -up[0]], [-up[1], up[0], 0]])
-    turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    turn = Rotation.from_rotvec(
+        rng.uniform(0, 2 * np.pi) * up / np.linalg.norm(up)).as_matrix()
     return _placed(Cloud(cloud.points @ turn.T), settings, lambda places: places @ turn.T,
                    lambda places: places @ turn)
 
@@ -141,22 +144,19 @@ def _in_unit(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cl
                    lambda places: places * factor, lambda places: places / factor)
 
 
-def _shuffled(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
-    return Cloud(cloud.points[rng.permutation(len(cloud))]), settings, unmoved
+def _shuffled(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return points[rng.permutation(len(points))]
 
 
-def _doubled(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
+def _doubled(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A fifth of the points twice."""
-    again = rng.choice(len(cloud), len(cloud) // 5, replace=False)
-    return Cloud(np.concatenate([cloud.points, cloud.points[again]])), settings, unmoved
+    return np.vstack([points, points[rng.choice(len(points), len(points) // 5, replace=False)]])
 
 
-def _with_outliers(cloud: Cloud, settings: dict, rng: np.random.Generator,
-                   ) -> tuple[Cloud, dict, Back]:
+def _with_outliers(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """1 % of points anywhere in the bounding box."""
-    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
-    stray = rng.uniform(low, high, (len(cloud) // 100, 3))
-    return Cloud(np.concatenate([cloud.points, stray])), settings, unmoved
+    box = points.min(axis=0), points.max(axis=0)
+    return np.vstack([points, rng.uniform(*box, (len(points) // 100, 3))])
 
 
 def _on_ground(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
@@ -216,9 +216,10 @@ def _noisy(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return points + 0.25 * spacing * rng.standard_t(3, size=points.shape)
 
 
-CHANGED = {AS_IT_IS: _as_it_is, "half": _half, "turn": _turned, "shuffle": _shuffled,
-           "shift": _shifted, "unit": _in_unit, "duplicates": _doubled,
-           "outliers": _with_outliers, "ground": _on_ground, "threads": _as_it_is}
+CHANGED = {AS_IT_IS: _as_it_is, "half": _of_points(_half), "turn": _turned,
+           "shuffle": _of_points(_shuffled), "shift": _shifted, "unit": _in_unit,
+           "duplicates": _of_points(_doubled), "outliers": _of_points(_with_outliers),
+           "ground": _on_ground, "threads": _as_it_is}
 """Changes to a scan, the most informative first."""
 DEGRADED: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
     "one-sided": _one_sided, "cut": _cut, "noisy": _noisy}
@@ -236,29 +237,23 @@ _LIKELY = 0.8  # probability from which a fork must be in both trees
 def runs(setting: Setting, tasks: list[tuple[str, str]]) -> list[Trial]:
     """Trials of scans and changes, as many as there is time for; a crash is a failure too."""
     seed = 1000 * setting.seed
-    return setting.trials("real scans", [(*task, seed) for task in tasks], partial(
-        measured, out=setting.out), "geometry", workers=None, catch=Exception)
+    return setting.trials("real scans", [(*task, seed) for task in tasks], measured, "geometry",
+                          workers=None, catch=Exception)
 
 
-def measured(task: tuple[str, str, int], out: Path | None) -> dict[str, Any]:
+def measured(task: tuple[str, str, int]) -> dict[str, Any]:
     """Reconstruct a scan, as it is or changed: the numbers of all rows.
 
     ``forks``: in the original's coordinates x, y, z, radius, probability.
     """
     if task[1] != "threads":
-        return _measured(task, out)
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = _THREADS
-    try:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            return pool.submit(_measured, task, out).result()
-    finally:
-        del os.environ["OMP_NUM_THREADS"]
-        if before is not None:
-            os.environ["OMP_NUM_THREADS"] = before
+        return _measured(task)
+    with patch.dict(os.environ, OMP_NUM_THREADS=_THREADS), ProcessPoolExecutor(
+            1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_measured, task).result()
 
 
-def _measured(task: tuple[str, str, int], out: Path | None) -> dict[str, Any]:
+def _measured(task: tuple[str, str, int]) -> dict[str, Any]:
     name, change, seed = task
     cloud, settings = _subject(name, seed)
     rng, back = np.random.default_rng([seed, *change.encode()]), unmoved
@@ -275,8 +270,6 @@ def _measured(task: tuple[str, str, int], out: Path | None) -> dict[str, Any]:
              "watertight": numbers["watertight"], "tets": numbers["tet_count"]}
     if name not in _REAL or change not in (AS_IT_IS, "half", *DEGRADED):
         return found
-    if out is not None and change == AS_IT_IS:
-        draw(out / f"{name}.png", made.cloud.points, skeleton, name)
     dropped, leaf = numbers["dropped_points"], made.cloud.attributes.get("leaf", np.zeros(1))
     axes = skeleton.moved(made.alignment.undo(skeleton.nodes)
                           * UNIT_METRES[settings.get("unit", "m")])
@@ -380,7 +373,6 @@ REAL = Asked("worlds, real scans with independent skeletons: length within its s
 WORSE = Asked("worlds, the same degraded (half, one-sided, cut, noisy)", "90 %; 8 %; 0")
 BARE = Asked("worlds, bare real scans: points called leaf or flying pixel", "under 1 % each")
 _INSIDE = 0.9  # fraction of lengths that their intervals must hold
-_CALLED = 0.01  # fraction of a bare scan's points
 
 
 def _why(trial: Trial) -> str:
@@ -395,10 +387,9 @@ def real_rows(setting: Setting) -> list[Row]:
         return [Row(*REAL_ROW, "not measured: no ../shared/data", None, 0)]
     shares = {run.task[0]: run["off_points"] for run in sound(done)}
     failed = [_why(run) for run in done if run.failure]
-    return [Row(*REAL_ROW, "; ".join([", ".join(f"{name} {share:.1%}" for name, share in
-                                                shares.items()), *failed]),
-                bool(shares and max(shares.values()) < 0.08 and not failed), len(done)),
-            *_body_rows(sound(done))]
+    told = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
+    met = bool(shares and max(shares.values()) < 0.08 and not failed)
+    return [Row(*REAL_ROW, "; ".join([told, *failed]), met, len(done)), *_body_rows(sound(done))]
 
 
 def _body_rows(done: list[Trial]) -> list[Row]:
@@ -448,7 +439,7 @@ def _bare_row(trials: list[Trial]) -> list[Row]:
     bare = [run for run in trials if _REAL[run.task[0]].bare]
     each = [_why(run) if run.failure else
             f"{run.task[0]} {run['called_leaf']:.1%} / {run['flying']:.1%}" for run in bare]
-    good = all(not run.failure and max(run["called_leaf"], run["flying"]) < _CALLED for run in bare)
+    good = all(not run.failure and max(run["called_leaf"], run["flying"]) < 0.01 for run in bare)
     return [Row(*BARE, "; ".join(each), good, len(bare))] if bare else []
 
 
@@ -479,9 +470,8 @@ def same_tree_rows(setting: Setting, only: str | None = None) -> list[Row]:
         differ, sure = other_forks(run["forks"], other["forks"])
         agree += all(max(run[name][0], other[name][0]) <= min(run[name][1], other[name][1])
                      for name in ("length_interval_m", "volume_interval_m3"))
-        if is_half:
-            half = max(half, off)
-        else:
+        half = max(half, is_half * off)
+        if not is_half:
             worst, every, likely = max(worst, off), every + differ, likely + sure
         if off > (_OFF_HALF if is_half else _OFF) or (sure and not is_half):
             notes.append(f"{run.task[0]} {run.task[1]} {off:.1%}, {differ} forks ({sure} likely)")

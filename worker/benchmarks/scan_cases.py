@@ -13,13 +13,10 @@ import numpy as np
 
 from benchmarks.worlds.sensors import Hits, cast
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.generated import BranchSpec, GeneratedBranch, generate_branch, scan
+from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import frames, tangents
 
 _PITCH = 1 / 900  # width of a pixel at a depth of 1
-_TREE_TWIGS = (9, 6, 4)  # on each axis of order 0, 1, 2
-_TREE_THINNEST = 0.006  # [m]
 
 
 @dataclass(frozen=True)
@@ -155,73 +152,6 @@ def leafy_case(seed: int) -> ScanCase:
     on_leaf = np.repeat([False, True], [len(branch.cloud.points), len(leaf)])
     return ScanCase(f"leafy_{seed}", seed, truth, np.vstack([branch.cloud.points, leaf]),
                     settings={"leave_out": True, "leaves": "cut"}, leaf=on_leaf)
-
-
-@dataclass
-class _Growing:
-    nodes: list[np.ndarray]
-    parent: list[np.ndarray]
-    radius: list[np.ndarray]
-
-    @property
-    def count(self) -> int:
-        return sum(len(nodes) for nodes in self.nodes)
-
-
-def generated_tree(seed: int, height: float, radius: float, spacing: float, noise: float,
-                    ) -> tuple[Skeleton, np.ndarray]:
-    """Make a tree of four orders and its scan: true skeleton, and points [m], shape [n, 3]."""
-    rng = np.random.default_rng(9000 + seed)
-    growing = _Growing([], [], [])
-    _grow(rng, growing, np.zeros(3), np.array([0.0, 0.0, 1.0]), height, radius, 0, -1)
-    skeleton = Skeleton.from_edges(np.vstack(growing.nodes), np.concatenate(growing.parent),
-                                   np.concatenate(growing.radius))
-    spec = BranchSpec(length=height, radius_root=radius, radius_tip=_TREE_THINNEST, noise=noise,
-                      point_spacing=spacing, occlusion=0.05)
-    return skeleton, scan(skeleton, spec, rng).points
-
-
-def _grow(rng: np.random.Generator, growing: _Growing, start: np.ndarray, direction: np.ndarray,
-          length: float, radius: float, order: int, hang: int) -> None:
-    axis = _axis(rng, start, direction, length, (0.25, 0.6, 0.8, 0.8)[order])
-    thin = max(0.25 * radius, _TREE_THINNEST)
-    thick = radius + (thin - radius) * np.linspace(0, 1, len(axis))**1.1
-    first = 0 if hang < 0 else 1
-    index = growing.count + np.arange(len(axis) - first)
-    if hang >= 0:
-        index = np.concatenate([[hang], index])
-    growing.nodes.append(axis[first:])
-    growing.radius.append(thick[first:])
-    growing.parent.append(np.concatenate([[-1], index[:-1]]) if hang < 0 else index[:-1])
-    if order == len(_TREE_TWIGS):
-        return
-    tangent = tangents(axis)
-    normals, binormals = frames(axis, tangent)
-    turn = rng.uniform(0, 2 * np.pi)
-    count = _TREE_TWIGS[order]
-    for place in np.linspace(0.2, 0.95, count) + rng.uniform(-0.03, 0.03, count):
-        at = int(np.clip(place * len(axis), 1, len(axis) - 2))
-        turn += 2.4 + rng.uniform(-0.4, 0.4)
-        angle = rng.uniform(0.5, 1.0)
-        aside = np.cos(turn) * normals[at] + np.sin(turn) * binormals[at]
-        twig = length * rng.uniform(0.35, 0.6) * (1 - 0.6 * place)
-        if twig > max(8 * thick[at], 0.25):
-            _grow(rng, growing, axis[at], np.cos(angle) * tangent[at] + np.sin(angle) * aside,
-                  twig, max(rng.uniform(0.4, 0.7) * thick[at], _TREE_THINNEST), order + 1,
-                  int(index[at]))
-
-
-def _axis(rng: np.random.Generator, start: np.ndarray, direction: np.ndarray, length: float,
-          bend: float) -> np.ndarray:
-    """A curve that turns by about ``bend`` [rad] to one side, with nodes 5 cm apart."""
-    count = max(round(length / 0.05), 4)
-    share = (np.arange(count) + 0.5) / count
-    side = rng.normal(size=3)
-    side -= (side @ direction) * direction
-    side /= np.linalg.norm(side)
-    turn = bend * share + 0.25 * bend * np.sin(2 * np.pi * share + rng.uniform(0, 2 * np.pi))
-    steps = np.cos(turn)[:, None] * direction + np.sin(turn)[:, None] * side
-    return np.vstack([start, start + np.cumsum(steps, axis=0) * length / count])
 
 
 KINDS: dict[str, Callable[[int], ScanCase]] = {

@@ -87,14 +87,6 @@ def _file(task: tuple[str, int], out: Path) -> Path:
     return out / f"{task[0].replace(':', '_')}_{task[1]}.csv"
 
 
-def collect(first: int, count: int, out: Path, seconds: float, kinds: Sequence[str] = _FIT_KINDS,
-            ) -> list[Trial]:
-    """Skeletons of ``count`` seeds of each kind, including those in ``out``."""
-    tasks = [(kind, seed) for seed in range(first, first + count) for kind in kinds]
-    return go_on("skeletons", tasks, partial(_collected, out=out), ("geometry",),
-                 out / "trials.jsonl", Budget(seconds), catch=LimberError)
-
-
 def outcomes(done: list[Trial], out: Path) -> dict[str, Outcomes]:
     """Evidence of each twig, of places on them and of bridges, and the outcomes."""
     told = {name: Outcomes() for name in SIGNS}
@@ -178,13 +170,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, required=True, help="first seed of each kind")
     parser.add_argument("--count", type=int, default=20, help="seeds of each kind")
     parser.add_argument("--out", type=Path, required=True, help="folder for the skeletons")
-    parser.add_argument("--seconds", type=float, default=600.0, help="time for new skeletons")
-    parser.add_argument("--kinds", nargs="+", choices=_FIT_KINDS, default=_FIT_KINDS)
     parser.add_argument("--left-out", nargs="+", default=["weber-penn"],
                         help="sources that the printed coefficients are not fitted to")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    done = collect(options.first, options.count, options.out, options.seconds, options.kinds)
+    tasks = [(kind, seed) for seed in range(options.first, options.first + options.count)
+             for kind in _FIT_KINDS]
+    done = go_on("skeletons", tasks, partial(_collected, out=options.out), ("geometry",),
+                 options.out / "trials.jsonl", Budget(600.0), catch=LimberError)
     for name, told in outcomes(done, options.out).items():
         tell(name, told, options.left_out)
     return 0

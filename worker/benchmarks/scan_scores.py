@@ -4,7 +4,6 @@ import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from benchmarks.scan_cases import KINDS, ScanCase
-from benchmarks.scan_pictures import draw
 from benchmarks.table import Setting
 from benchmarks.trials import Trial, column, sound
 from benchmarks.worlds.sources import WORLDS
@@ -84,38 +82,24 @@ def outcomes(setting: Setting, counts: dict[str, int]) -> dict[str, Outcomes]:
     """Reconstruct and score cases of each kind in turn, as many as there is time for.
 
     Args:
-        setting: Pictures of every case go to its ``out``; cases kept from other parts or an earlier
-            run are not repeated.
+        setting: Cases kept from other parts or an earlier run are not repeated.
         counts: Most cases of each kind.
     """
     seeds = setting.seeds(max(counts.values()), max(counts.values()))
     trials = setting.trials(
         "cases", [(kind, seed) for seed in seeds for kind, count in counts.items()
                   if seed < seeds.start + count],
-        partial(scored_case, out=setting.out), "geometry", workers=None, catch=Exception)
+        scored_case, "geometry", workers=None, catch=Exception)
     return {kind: Outcomes([trial for trial in trials if trial.task[0] == kind]) for kind in counts}
 
 
-def scored_case(task: tuple[str, int], out: Path | None) -> dict[str, Any]:
-    """Scores of one case by kind and seed; its picture is written to ``out``."""
-    case = (KINDS | WORLDS)[task[0]](task[1])
+def scored_case(task: tuple[str, int]) -> dict[str, Any]:
+    """Write the file of a case by kind and seed, reconstruct it, score it in the file's frame."""
     with tempfile.TemporaryDirectory() as folder:
-        scored, found = run_case(case, Path(folder))
-    if out is not None:
-        draw(out / f"{case.name}.png", case.points, found,
-             f"{case.name}: centre {scored['centre_radii']:.2f} r, radius "
-             f"{scored['radius_bias']:+.1%}, volume {scored['volume']:+.1%},\nforks "
-             f"{scored['forks_found']}/{scored['forks']} + {scored['forks_false']} false, main "
-             f"axis {scored['main_axis_radii']:.1f} r", seen_part(case.truth, case.points))
-    return scored
+        return _scored((KINDS | WORLDS)[task[0]](task[1]), Path(folder))
 
 
-def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
-    """Write a case's file, reconstruct it, score it in the file's frame.
-
-    Raises:
-        LimberError: it could not be reconstructed.
-    """
+def _scored(case: ScanCase, folder: Path) -> dict[str, Any]:
     path, branch = case.write(folder), folder / f"{case.name}.branch"
     result = Reconstruct(cloud=path, output=branch, **{"root": "auto"} | case.settings).run()
     manifest = json.loads((branch / "branch.json").read_text())
@@ -141,7 +125,7 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
     paper = nearest_point_radii(found, case.points, SkeletonSettings()).radius
     scored["paper"] = float(np.median(np.abs(paper / found.radius - 1)))
     scored["watertight"] = result["watertight"]
-    return scored | dropped_points(case, branch), found
+    return scored | dropped_points(case, branch)
 
 
 def held(interval: list[float], value: float) -> bool:
@@ -372,17 +356,3 @@ def explained(points: np.ndarray, skeleton: Skeleton) -> float:
     _, residual = nearest_cylinders(skeleton, points)
     own = np.median(cKDTree(points).query(points, k=min(5, len(points)))[0][:, 1:], axis=1)
     return float((residual <= 2 * own).mean())
-
-
-def axes_found(truth: Skeleton, found: Skeleton, spacing: float, step: float = 0.02,
-               ) -> tuple[float, float]:
-    """Fractions of the true axes' length that are found, and of the found axes' that are true.
-
-    An axis is correct if it is within the true radius, or the points' ``spacing`` [m], of a true
-    one, compared every ``step`` [m].
-    """
-    there, here = Dense.of(truth, step=step), Dense.of(found, step=step)
-    missed = cKDTree(here.points).query(there.points)[0] > np.maximum(there.radius, spacing)
-    distance, near = cKDTree(there.points).query(here.points)
-    right = distance <= np.maximum(there.radius[near], spacing)
-    return float(1 - missed.mean()), float(right.mean())

@@ -13,7 +13,7 @@ from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaves_by_odds
 from limber.geometry.cloud.preparation import Prepared, prepare
-from limber.geometry.cloud.surroundings import Support
+from limber.geometry.cloud.surroundings import Part
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
 from limber.geometry.leaf_removal import _on_round_axes, check_agreed, show_leaves, without_leaves
@@ -160,7 +160,7 @@ def test_a_refusal_shows_its_points_by_class(tmp_path, monkeypatch) -> None:
 
     def refuse(raw: Cloud, settings: ReconstructSettings, *, show, **_: object) -> None:
         with shown_if_refused(show, prepared, [Leaf(np.arange(10), 1e-3)],
-                              [Support("stake", np.array([59]), np.zeros(3))], off):
+                              [Part("stake", np.array([59]), 1.0)], off):
             raise InputError("leaves")
     monkeypatch.setattr("limber.geometry.reconstruction.reconstruct_cloud", refuse)
     cloud.write_ply(tmp_path / "scan.ply")

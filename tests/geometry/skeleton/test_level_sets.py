@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial import cKDTree
 from tests.subjects.leafy import curved_leaves
 
-from benchmarks.scan_cases import generated_tree
-from benchmarks.scan_scores import axes_found, explained
-from limber.geometry.generated import generate_branch
+from benchmarks.scan_scores import explained, score
+from benchmarks.worlds.plants import weber_penn
+from limber.geometry.generated import BranchSpec, generate_branch, scan
 from limber.geometry.skeleton.contraction import contract, is_sparse, level_graph
 from limber.geometry.skeleton.radii.axis_fit import NormalEquations
 from limber.geometry.skeleton.search_result import SkeletonResult
@@ -31,7 +31,9 @@ def of_leaves(leaves) -> SkeletonResult:
 @pytest.fixture(scope="module")
 def crown() -> tuple[Skeleton, np.ndarray]:
     """True axes of a sparse crown, and its points."""
-    return generated_tree(31, 2.0, 0.025, 0.015, 0.003)
+    rng = np.random.default_rng(31)
+    truth = weber_penn(rng).skeleton
+    return truth, scan(truth, BranchSpec(noise=0.0015, point_spacing=0.0075), rng).points
 
 
 def test_levels_keep_near_twigs_apart() -> None:
@@ -69,8 +71,8 @@ def test_crown_of_thin_twigs_is_found(crown) -> None:
     """Most of a sparse crown's axes are found, and most of what is found is true."""
     truth, points = crown
     found = skeletonise(points, root=truth.nodes[0]).skeleton
-    recall, right = axes_found(truth, found, 0.015)
-    assert recall > 0.75 and right > 0.8
+    scored = score(truth, found)
+    assert scored["recall"] > 0.75 and scored["right"] > 0.8
     assert explained(points, found) > 0.95
 
 

@@ -1,4 +1,4 @@
-"""What stands in a world (wood, leaves, a pot, a stake), and what sensors see of it."""
+"""What stands in a world (wood, leaves), and what sensors see of it."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.worlds.plants import Plant, sheet_triangles
 
-WOOD, LEAF, SUPPORT = 0, 1, 2
+WOOD, LEAF = 0, 1
 
 
 @dataclass(frozen=True)
@@ -42,23 +42,6 @@ def leafy(plant: Plant, rng: np.random.Generator) -> Scene:
     return scene
 
 
-def potted(plant: Plant, rng: np.random.Generator) -> Scene:
-    """In a pot, tied to a stake by a wire."""
-    scene = Scene.bare(plant)
-    base = plant.nodes[0]
-    height, wide = 0.1, rng.uniform(0.05, 0.08)
-    pot = _revolved(base, [(0.75 * wide, -height), (wide, 0.02), (wide - 0.004, 0.02),
-                           (wide - 0.006, 0.0), (0.0, 0.0)])
-    beside = base + [0.6 * wide, 0.0, 0.0]
-    top = float(np.ptp(plant.nodes[:, 2])) * rng.uniform(0.5, 0.8)
-    stake = _revolved(beside, [(0.005, 0.0), (0.005, top), (0.0, top)])
-    stem = plant.nodes[int(np.argmin(np.abs(plant.nodes[:, 2] - base[2] - 0.5 * top)
-                                     + np.linalg.norm(plant.nodes[:, :2] - base[:2], axis=1)))]
-    wire = Plant(np.linspace(beside + [0, 0, 0.5 * top], stem, 12), np.arange(-1, 11),
-                 np.full(12, 0.001))
-    return scene.plus(np.concatenate([pot, stake, wire.skin()]), SUPPORT)
-
-
 def _blade(at: np.ndarray, along: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A leaf with a stalk's gap of 4 mm, arched along and across."""
     along = along / max(float(np.linalg.norm(along)), 1e-9) + 0.8 * rng.normal(size=3)
@@ -74,13 +57,12 @@ def _blade(at: np.ndarray, along: np.ndarray, rng: np.random.Generator) -> np.nd
     return sheet_triangles(grid)
 
 
-def _revolved(base: np.ndarray, profile: list[tuple[float, float]]) -> np.ndarray:
+def revolved(base: np.ndarray, profile: list[tuple[float, float]]) -> np.ndarray:
     """A profile of (radius, height) [m] turned about the vertical through ``base``."""
     angle = np.linspace(0, 2 * np.pi, 33)[:-1]
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(32)], axis=1)
-    dense = np.array(profile)
     return sheet_triangles(np.array([base + radius * ring + [0, 0, height]
-                                     for radius, height in dense]), closed=True)
+                                     for radius, height in profile]), closed=True)
 
 
 # --- rays through the pixels of a view against triangles: the nearest hit of each ---------------
@@ -205,15 +187,12 @@ class Seen:
 
 def one_station(scene: Scene, rng: np.random.Generator, noise: float) -> Seen:
     """A terrestrial laser scanner: noise along its rays, blurred edges, coordinates on a map."""
-    return _stations(scene, rng, noise, 1)
+    return stations(scene, rng, noise, 1)
 
 
-def stations(scene: Scene, rng: np.random.Generator, noise: float) -> Seen:
+def stations(scene: Scene, rng: np.random.Generator, noise: float, count: int = 0) -> Seen:
     """Three to five stations all around, each with its own error of registration."""
-    return _stations(scene, rng, noise, int(rng.integers(3, 6)))
-
-
-def _stations(scene: Scene, rng: np.random.Generator, noise: float, count: int) -> Seen:
+    count = count or int(rng.integers(3, 6))
     middle, size = _middle(scene)
     begin, parts, labels = rng.uniform(0, 2 * np.pi), [], []
     spacing = rng.uniform(0.0013, 0.0022) * (1 if count == 1 else 1.5)
@@ -286,6 +265,16 @@ def hand_scanner(scene: Scene, rng: np.random.Generator, noise: float) -> Seen:
     points = points + 0.5 * noise * rng.normal(size=points.shape)
     _, first = np.unique(np.round(points / 0.0017).astype(int), axis=0, return_index=True)
     return _placed(points[first], label[first])
+
+
+def strewn(scene: Scene, rng: np.random.Generator, noise: float) -> Seen:
+    """Points anywhere on the surfaces, seen or not, with the same noise in all directions."""
+    start, one, other = scene.triangles.transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(one - start, other - start), axis=1) / 2
+    own = rng.choice(len(area), int(area.sum() / rng.uniform(0.003, 0.008)**2),
+                     p=area / area.sum())
+    points = np.einsum("tk,tkj->tj", rng.dirichlet(np.ones(3), len(own)), scene.triangles[own])
+    return _placed(points + rng.normal(0, noise, points.shape), scene.label[own])
 
 
 def _walked(scene: Scene, rng: np.random.Generator, views: int, spacing: float, drift: float,

@@ -77,15 +77,6 @@ def leafy_case(seed: int, source: str) -> ScanCase:
                  {"leave_out": True, "leaves": "cut"}, seen.label == sensors.LEAF)
 
 
-def potted_case(seed: int, source: str) -> ScanCase:
-    """A plant in a pot, tied to a stake."""
-    rng = _generator(seed, source, "potted")
-    plant = SOURCES[source](rng)
-    seen = rng.choice(ALL_AROUND)(sensors.potted(plant, rng), rng, 0.0005)
-    return _case(f"{source}_potted_{seed}", seed, plant, seen, {"leave_out": True},
-                 seen.label == sensors.SUPPORT)
-
-
 def sparse_case(seed: int, source: str, view: str) -> ScanCase:
     """300 to 1,500 points of a branch, noise 2 to 3 mm, and 1 to 3 % of points anywhere."""
     rng = _generator(seed, source, view, "sparse")
@@ -116,6 +107,5 @@ def _case(name: str, seed: int, plant: Plant, seen: Seen, settings: dict,
 WORLDS: dict[str, Callable[[int], ScanCase]] = {
     **{f"{source}:{view}": partial(bare_case, source=source, view=view)
        for view in BARE_VIEWS for source in SOURCES},
-    **{f"{source}:leafy": partial(leafy_case, source=source) for source in SOURCES},
-    **{f"{source}:potted": partial(potted_case, source=source) for source in SOURCES}}
+    **{f"{source}:leafy": partial(leafy_case, source=source) for source in SOURCES}}
 """Cases by source and view, from a seed."""

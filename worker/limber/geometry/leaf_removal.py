@@ -11,7 +11,7 @@ from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import thinned
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_evidence
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
-from limber.geometry.cloud.surroundings import Support
+from limber.geometry.cloud.surroundings import Part
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
@@ -33,7 +33,7 @@ _ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 
 def without_leaves(prepared: Prepared, found: SkeletonResult | None = None,
-                   supports: Sequence[Support] = ()) -> tuple[Prepared, list[Leaf]]:
+                   supports: Sequence[Part] = ()) -> tuple[Prepared, list[Leaf]]:
     """Return the wood of a scan, and the removed leaves: none if they have under 5 % of the
     points. ``supports``, and what is round by ``found``, the whole scan's skeleton, are no leaves.
     """

@@ -16,7 +16,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.cloud.preparation import Prepared, prepare, size_doubts
 from limber.geometry.cloud.surroundings import (
-    Support,
+    Part,
     find_supports,
     named_if_refused,
     supports_text,
@@ -79,7 +79,7 @@ Show = Callable[[Cloud], None]
 
 @contextmanager
 def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
-                     supports: list[Support], off_axes: np.ndarray | None = None,
+                     supports: list[Part], off_axes: np.ndarray | None = None,
                      ) -> Iterator[None]:
     """Show the points by class if what is done meanwhile refuses the scan; None: nobody looks.
     ``off_axes`` [rest] says which points of no leaf or support are on no round axis."""
@@ -91,7 +91,7 @@ def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
         raise
 
 
-def classified(prepared: Prepared, leaves: list[Leaf], supports: list[Support],
+def classified(prepared: Prepared, leaves: list[Leaf], supports: list[Part],
                off_axes: np.ndarray | None = None, apart: np.ndarray | None = None) -> Cloud:
     """Return the points with columns ``class`` and ``color``, see :func:`shown_if_refused`.
     ``apart`` [n] says which of them belong to another plant."""
@@ -177,14 +177,15 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         is_stated=raw.unit is not None or "unit" in settings.model_fields_set)
     for text in prepared.warnings:
         progress.warn(text)
-    supports = [] if own is not None else find_supports(prepared.cloud.points,
-                                                        np.array(settings.up, float))
+    parts = [] if own is not None else find_supports(prepared.cloud.points,
+                                                     np.array(settings.up, float))
+    supports = [each for each in parts if each.probability >= OPEN]
     if known is not None and not known.fits(len(prepared.cloud)):
         progress.warn("The skeleton that an earlier run stored belongs to another number of "
                       "points. It is searched for again.")
         known = None
-    named = "" if not supports else supports_text(
-        supports, len(prepared.cloud)).moved(prepared.outside)
+    named = "" if not parts else supports_text(
+        parts, prepared.cloud.points).moved(prepared.outside)
     with named_if_refused(named), places_moved(prepared.outside):
         found, wood, leaves = (
             _searched(prepared, settings, own, supports, show, progress.part(0.02, 0.55))
@@ -248,7 +249,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
 
 
 def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
-              supports: list[Support], show: Show | None, progress: Progress,
+              supports: list[Part], show: Show | None, progress: Progress,
               ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
     """The skeleton, the part of the scan in which it was found, and the leaves removed from it."""
     def show_apart(apart: np.ndarray) -> None:
@@ -268,7 +269,7 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
         found, prepared, [])
 
 
-def _most_off(found: SkeletonResult, settings: ReconstructSettings, supports: list[Support],
+def _most_off(found: SkeletonResult, settings: ReconstructSettings, supports: list[Part],
               ) -> float:
     """Fraction of points off all axes up to which a scan is accepted."""
     # Who keeps the leaves has answered for the points beside axes that go through them.

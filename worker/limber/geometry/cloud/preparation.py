@@ -10,12 +10,13 @@ from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import Cloud, own_axes
 from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels, scan_line_view
-from limber.geometry.cloud.surroundings import Sheet, find_ground, find_sheet
+from limber.geometry.cloud.surroundings import Part, find_ground, find_sheet, middle
 from limber.geometry.settings import OPEN, PreparationSettings
 
 POINT_MINIMUM = 50
 _SHEET_LEAST = 0.08  # smallest fraction of the points that makes a wall or the ground
 _SHEETS_MOST = 6  # a box has six
+_NAMES = {"sheet": "a wide flat sheet", "ground": "ground"}
 _AT_ONCE = 200_000  # points whose neighbours are held in memory at a time
 # A step between neighbouring pixels of a depth camera is no surface if that surface would be seen
 # at a larger angle [degrees]. Fewer pixels than the speck between such steps are flying pixels: of
@@ -126,52 +127,50 @@ def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
 
 
 def _beside_plant(points: np.ndarray, up: np.ndarray | None, counts: dict[str, int],
-                  ) -> tuple[np.ndarray, list[Sheet]]:
+                  ) -> tuple[np.ndarray, list[Part]]:
     """Mask of walls and ground, unless little else remains: that is refused later. Also the sheets
     of which it is an open question whether they are any."""
     on, least = np.zeros(len(points), bool), max(0.1 * len(points), POINT_MINIMUM)
-    rest, open_ = np.arange(len(points)), list[Sheet]()
+    open_, ground = list[Part](), None if up is None else find_ground(points, up)
+    if ground is not None and len(points) - len(ground.points) >= least:
+        open_ += [ground] if 1 - OPEN < ground.probability < OPEN else []
+        if ground.log_odds > 0:
+            on[ground.points] = True
+            counts["ground"] = len(ground.points)
+    rest = np.flatnonzero(~on)
     for _ in range(_SHEETS_MOST):
         sheet = find_sheet(points[rest], _SHEET_LEAST * len(points))
         if sheet is None:
             break
-        if 1 - OPEN < sheet.probability < OPEN:
-            open_.append(sheet._replace(on=np.isin(np.arange(len(points)), rest[sheet.on])))
-        if sheet.probability < 0.5:
+        sheet = sheet._replace(points=rest[sheet.points])
+        open_ += [sheet] if 1 - OPEN < sheet.probability < OPEN else []
+        if sheet.log_odds < 0:
             break
-        rest = rest[~sheet.on]
-    counts["sheets"] = 0
-    if len(rest) >= least:
+        rest = np.setdiff1d(rest, sheet.points)
+    counts["sheets"] = int((~on).sum()) - len(rest) if len(rest) >= least else 0
+    if counts["sheets"]:
         on[np.setdiff1d(np.arange(len(points)), rest)] = True
-        counts["sheets"] = int(on.sum())
-    rest = np.flatnonzero(~on)
-    ground = None if up is None else find_ground(points[rest], up, _SHEET_LEAST * len(rest))
-    if ground is not None and (~ground).sum() >= max(0.1 * len(rest), POINT_MINIMUM):
-        on[rest[ground]] = True
-        counts["ground"] = int(ground.sum())
     return on, open_
 
 
-def _sheet_texts(points: np.ndarray, on: np.ndarray, open_: list[Sheet], counts: dict[str, int],
+def _sheet_texts(points: np.ndarray, on: np.ndarray, open_: list[Part], counts: dict[str, int],
                  ) -> list[str]:
     """What was removed of points [n, 3] in the file's coordinates, and which sheets are open."""
-    def middle(mask: np.ndarray) -> Place:
-        away = np.linalg.norm(points[mask] - np.median(points[mask], axis=0), axis=1)
-        return Place(points[mask][np.argmin(away)])
-
     keep = Option("keep", ("sheets",))
     texts: list[str] = [Text(
         f"{on.sum()} of {counts['read']} points lie on wide flat sheets or rough ground, as at ",
-        middle(on), ", and were removed (", keep, " keeps them).")] if on.any() else []
+        Place(middle(points[on])), ", and were removed (", keep, " keeps them).")
+        ] if on.any() else []
     for sheet in open_:
-        rest = points[~sheet.on]
+        rest = np.delete(points, sheet.points, axis=0)
         box = (*rest.min(axis=0).tolist(), *rest.max(axis=0).tolist()) if len(rest) else None
-        done = ("They were removed. If they are the plant's: ", keep) if on[sheet.on].all() else (
-            "They were kept. If they are a wall: ", Option("crop", box))
+        is_gone = on[sheet.points].all()
+        done = ("They were removed. If they are the plant's: ", keep) if is_gone else (
+            "They were kept. If they are no plant's: ", Option("crop", box))
         texts.append(Text(
-            f"Are {sheet.on.sum()} points a wide flat sheet, as at ", middle(sheet.on), ", or the "
-            f"plant's? They are a sheet with a probability of {sheet.probability:.2f}. ", *done,
-            "."))
+            f"Are {len(sheet.points)} points {_NAMES[sheet.kind]}, as at ", Place(middle(
+                points[sheet.points])), ", or the plant's? They are that with a probability of "
+            f"{sheet.probability:.2f}. ", *done, "."))
     return texts
 
 

@@ -1,20 +1,66 @@
-"""What stands around a plant in its scan: ground, walls, pots, stakes, posts and wires."""
+"""What stands around a plant in its scan: ground, walls, pots, stakes, posts and wires.
 
-from collections.abc import Callable, Iterator
+Shapes propose parts of a scan: circles in slices, lines, planes, a lowest layer. What speaks
+against each is measured without unit, 0 for a perfect one of its kind. One table of weights,
+trained by ``benchmarks.part_training`` on scenes with truth, makes odds of it.
+"""
+
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import cKDTree
-from scipy.special import ndtr
+from scipy.special import expit, log_ndtr
 
 from limber.core.errors import InputError, Option, Place, Text
+from limber.core.files.reading import read_arrays
 from limber.core.numerics.rigid import principal_axes
 from limber.geometry.cloud.cloud import own_order
+from limber.geometry.settings import OPEN
 
-# Pots, stakes, posts and wires in a scan of a plant, found by their shape and never removed.
+ODDS = Path(__file__).with_name("part_odds.npz")
+_MOST = 5.0  # most that speaks against a part in one way
+
+
+class Part(NamedTuple):
+    """A part of a scan that may be a ``kind`` of thing: indices of its points, the logarithm of its
+    odds, and what speaks ``against`` it."""
+
+    kind: str
+    points: np.ndarray
+    log_odds: float
+    against: np.ndarray = np.zeros(0)
+
+    @classmethod
+    def judged(cls, kind: str, points: np.ndarray, against: list[float]) -> "Part":
+        """A part with the trained odds of its kind."""
+        weights, seen = _weights()[MODEL.get(kind, kind)], np.minimum(against, _MOST)
+        return cls(kind, points, float(weights[0] + weights[1:] @ seen), seen)
+
+    @property
+    def probability(self) -> float:
+        return float(expit(self.log_odds))
+
+
+MODEL = {"post": "stake"}
+"""Kinds that have the odds of another."""
+
+
+def middle(points: np.ndarray) -> np.ndarray:
+    """The one of points [n, 3] that is nearest to their middle: that itself may be empty."""
+    return points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]
+
+
+@cache
+def _weights() -> dict[str, np.ndarray]:
+    return read_arrays(ODDS, "the odds of a scan's parts, a part of Limber")
+
+
+# Pots, stakes, posts and wires: never removed.
 #
 # A pot is a body turned about an upright axis at the foot of the scan, which ends where the stem
 # leaves it. A stake is straight to a fraction of its radius and as thick above as below, for far
@@ -26,55 +72,39 @@ _SLICES = 40  # over the height of the scan
 _LEAST = 8  # points of a slice's circle
 _ROUND = 0.08  # fraction of the radius by which the points of a circle scatter
 _ON_CIRCLE = 0.6  # fraction of a slice's points that must be on its circle
-# Slices of a pot at least; the fraction of the next slice's points that go on with it, and its
-# height over its radius, at most.
-_POT_SLICES, _GOES_ON, _TALL = 3, 0.2, 4.0
-_STEADY = 0.25  # largest change of a pot's radius from slice to slice
-_LONG = 14  # slices that a stake crosses at least
-# A stake: scatter of its middles over its radius, and of the logarithms of its radii; fall of these
-# over its length; slope against the upright.
-_STRAIGHT, _EVEN, _FALL, _SLOPE = 0.15, 0.12, 0.08, 0.27
-_STAKES_MOST = 3
+_RODS = 6  # places where most slices have points: where stakes may be
 _ROD_POINTS = 8000  # points that show a stake's circles, 200 a slice
 _STAKE_WIDTHS = (0.5, 2.0)  # thicknesses of a slice around its first middle: where a stake may be
+_EVEN = 0.02  # scatter of a perfect stake's or wire's thickness as a scan shows it, of a logarithm
+_AROUND, _FOOT = (2.0, 5.0), 0.02  # radii around a stake; fraction of what is beyond, lowest
 _THICK_POST = 0.02  # radius of a post [m]; thinner ones are stakes
 # A wire is looked for among so many points, from so many places that are on thin lines at this
 # fraction of the scan's diagonal.
 _WIRE_POINTS, _WIRE_STARTS, _WIRE_SCALE = 20_000, 120, 0.03
-_LINE = 0.1  # largest second spread of points on a thin line, over the first
-# A wire: length over its radius, at least; sag over its length, slope, distance of its ends from a
-# support or the scan's border over its length, at most; fraction of its slices without points, and
-# with points around it as of laterals, at most.
-_THIN, _SAG, _WIRE_SLOPE, _ENDS = 120.0, 0.1, 0.6, 0.04
-_MISSING, _LATERALS = 0.15, 0.3
+# Largest second spread of points on a thin line, over the first, and its largest rise.
+_LINE, _STEEP = 0.1, 0.6
 _BESIDE = (3.0, 8.0)  # radii between which points beside a wire show a lateral
-_WIRES_MOST = 12
 
 
-@dataclass(frozen=True)
-class Support:
-    """A ``pot``, ``stake``, ``post`` or ``wire``: indices of its points in the scan, and ``at`` [3]
-    [m], the one in its middle."""
-
-    kind: str
-    points: np.ndarray
-    at: np.ndarray
-
-
-def find_supports(points: np.ndarray, up: np.ndarray) -> list[Support]:
-    """Return the pot, the stakes, the posts and the wires in a scan of points [n, 3] [m]."""
+def find_supports(points: np.ndarray, up: np.ndarray) -> list[Part]:
+    """Return what may be pots, stakes, posts and wires in a scan of points [n, 3] [m]."""
     some = np.arange(0, len(points), len(points) // _SUPPORT_SAMPLE + 1)
-    found = _in_sample(points[some], up / np.linalg.norm(up))
+    sample, placed = points[some], upright(points[some], up)
+    found = _likely(bodies(placed), len(some))
+    found += _likely(wires(sample, placed, found), len(some))
     if len(some) < len(points) and found:
-        near = cKDTree(points[some]).query(points)[1]
-        found = [replace(each, points=np.flatnonzero(np.isin(near, each.points))) for each in found]
+        near = cKDTree(sample).query(points)[1]
+        found = [each._replace(points=np.flatnonzero(np.isin(near, each.points)))
+                 for each in found]
     return found
 
 
-def supports_text(supports: list[Support], count: int) -> Text:
-    """Return a sentence that names the supports, at least one, of a scan of ``count`` points."""
-    named = [Text(f"a {each.kind} ({100 * len(each.points) / count:.0f} % of the points) at ",
-                  Place(each.at)) for each in supports]
+def supports_text(supports: list[Part], points: np.ndarray) -> Text:
+    """Return a sentence that names the supports, at least one, of a scan of points [n, 3]."""
+    named = [Text(f"{'' if each.probability >= OPEN else 'perhaps '}a {each.kind} ("
+                  f"{100 * len(each.points) / len(points):.0f} % of the points"
+                  f"{'' if each.probability >= OPEN else f', probability {each.probability:.2f}'}"
+                  ") at ", Place(middle(points[each.points]))) for each in supports]
     return Text("The scan shows ", Text.joined(" and ", named), ": remove such points from the "
                 "scan (", Option("crop"), ", or in another program), or they count as the plant's.")
 
@@ -90,30 +120,35 @@ def named_if_refused(text: str) -> Iterator[None]:
         raise
 
 
-def _in_sample(points: np.ndarray, up: np.ndarray) -> list[Support]:
-    """The supports among points [m], shape [n, 3]; ``up`` is a unit vector."""
-    across = np.linalg.svd(up[None])[2][1:]
-    height, flat = points @ up, points @ across.T
+def _likely(parts: Iterable[Part], count: int) -> list[Part]:
+    """Parts that are not unlikely, the likeliest first; most points of each are in no other."""
+    free, found = np.ones(count, bool), list[Part]()
+    for part in sorted(parts, key=lambda each: -each.log_odds):
+        if part.probability > 1 - OPEN and free[part.points].mean() > 0.5:
+            found.append(part._replace(points=part.points[free[part.points]]))
+            free[part.points] = False
+    return found
+
+
+def upright(points: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Points [n, 3] with the height last."""
+    up = up / np.linalg.norm(up)
+    return points @ np.vstack([np.linalg.svd(up[None])[2][1:], up]).T
+
+
+def bodies(placed: np.ndarray) -> Iterator[Part]:
+    """What may be a pot, a stake or a post among points [n, 3] [m] with the height last."""
+    flat, height = placed[:, :2], placed[:, 2]
     thick = max(float(np.ptp(height)) / _SLICES, 1e-12)
     layer = np.minimum(((height - height.min()) / thick).astype(np.int64), _SLICES - 1)
-    pot = _pot(flat, layer, thick)
-    found = [] if pot is None else [("pot", pot)]
-    rest = np.ones(len(points), bool)
-    if pot is not None:
-        rest[pot] = False
-    for _ in range(_STAKES_MOST):
-        stake = _stake(flat, layer, height, np.flatnonzero(rest), thick)
-        if stake is None:
-            break
-        own, radius = stake
-        rest[own] = False
-        found.append(("post" if radius > _THICK_POST else "stake", own))
-    held = points[np.concatenate([own for _, own in found])] if found else np.empty((0, 3))
-    found += [("wire", own) for own in _wires(points, np.column_stack([flat, height]),
-                                              np.flatnonzero(rest), held @ np.vstack(
-                                                  [across, up]).T)]
-    return [Support(kind, own, points[own][np.argmin(np.linalg.norm(
-        points[own] - np.median(points[own], axis=0), axis=1))]) for kind, own in found]
+    yield from _pots(flat, layer, thick)
+    cell, of = np.unique(np.floor(flat / thick).astype(np.int64), axis=0, return_inverse=True)
+    pairs = np.unique(np.column_stack([of.ravel(), layer]), axis=0)
+    crossed = np.bincount(pairs[:, 0], minlength=len(cell))
+    for start in np.argsort(-crossed, kind="stable")[:_RODS]:
+        middle = np.median(flat[of.ravel() == start], axis=0)
+        for wide in _STAKE_WIDTHS:
+            yield from _rods(flat, layer, height, middle, wide * thick)
 
 
 def _circles(flat: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -146,113 +181,95 @@ def _circles(flat: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarra
         count < _LEAST, 0.0, on / np.maximum(count, 1))
 
 
-def _pot(flat: np.ndarray, layer: np.ndarray, thick: float) -> np.ndarray | None:
-    """Indices of the points of a pot at the foot of the scan; None if there is none."""
-    circles: list[tuple[np.ndarray, float]] = []
+def _pots(flat: np.ndarray, layer: np.ndarray, thick: float) -> Iterator[Part]:
+    """What may be a pot at the foot of the scan, up to each slice of its lower half."""
     low = layer <= _SLICES // 2
-    for number, (middle, radius, share) in enumerate(zip(*_circles(flat[low], layer[low]),
-                                                         strict=True)):
-        # Its soil fills the last slice; the scan's first slice may be a part of one.
-        if number >= _SLICES // 2 or share < _ON_CIRCLE or (circles and (
-                abs(radius / circles[-1][1] - 1) > _STEADY
-                or np.linalg.norm(middle - circles[-1][0]) > _STEADY * radius)):
-            if circles or number > 1:
-                break
-            continue
-        circles.append((middle, radius))
-    if len(circles) < _POT_SLICES:
-        return None
-    top = number - 1
-    middle, radius = circles[-1]
-    distance = np.linalg.norm(flat - middle, axis=1)
-    above = distance[layer == top + 1]
-    goes_on = np.mean(np.abs(above - radius) < 3 * _ROUND * radius) if len(above) else 1.0
-    if goes_on > _GOES_ON or len(circles) * thick > _TALL * radius:
-        return None
-    return np.flatnonzero((layer <= top) & (distance < 1.2 * radius))
+    middle, radius, share = _circles(flat[low], layer[low])
+    for top in range(2, _SLICES // 2):
+        # The scan's first slice may be a part of one.
+        own = slice(1, top + 1)
+        away = np.linalg.norm(flat - middle[top], axis=1)
+        side = np.bincount(layer[np.abs(away - radius[top]) < 3 * _ROUND * radius[top]],
+                           minlength=_SLICES)
+        goes_on = side[top + 1] / max(np.median(side[own]), 1)
+        shift = np.linalg.norm(np.diff(middle[own], axis=0), axis=1) / radius[top]
+        inside = np.bincount(layer[away < 1.2 * radius[top]], minlength=_SLICES)
+        points = np.flatnonzero((layer <= top) & (away < 1.2 * radius[top]))
+        if len(points):
+            yield Part.judged("pot", points, [
+                1 - share[own].mean(), shift.mean(), goes_on, top * thick / radius[top] / 4,
+                1 / top, inside[top + 1:top + 4].mean() / max(np.median(inside[own]), 1),
+                1 - len(points) / (layer <= top).sum(), thick / radius[top],
+                radius[top] / thick / 10])
 
 
-def _stake(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarray,
-           thick: float) -> tuple[np.ndarray, float] | None:
-    """Indices of the points of the longest stake among ``rest``, and its radius [m]."""
-    cell, of = np.unique(np.floor(flat[rest] / thick).astype(np.int64), axis=0, return_inverse=True)
-    pairs = np.unique(np.column_stack([of.ravel(), layer[rest]]), axis=0)
-    crossed = np.bincount(pairs[:, 0], minlength=len(cell))
-    for start in np.argsort(-crossed, kind="stable")[:2 * _STAKES_MOST]:
-        if crossed[start] < _LONG:
-            return None
-        middle = np.median(flat[rest[of.ravel() == start]], axis=0)
-        for wide in _STAKE_WIDTHS:
-            told = _rod(flat, layer, height, rest, middle, wide * thick)
-            if told is not None:
-                return told
-    return None
-
-
-def _rod(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarray,
-         start: np.ndarray, reach: float) -> tuple[np.ndarray, float] | None:
-    """The stake through ``start`` [m], shape [2]: its points and radius; None if there is none."""
+def _rods(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, start: np.ndarray, reach: float,
+          ) -> Iterator[Part]:
+    """The stake that may go through ``start`` [m], shape [2]."""
     line = np.array([[start[0], 0.0], [start[1], 0.0]])
     for _ in range(4):
-        aside = np.linalg.norm(flat[rest] - line[:, 0] - height[rest, None] * line[:, 1], axis=1)
-        near = rest[aside < reach]
+        aside = np.linalg.norm(flat - line[:, 0] - height[:, None] * line[:, 1], axis=1)
+        near = np.flatnonzero(aside < reach)
         some = near[own_order(flat[near])[:_ROD_POINTS]] if len(near) else near
         middle, radius, share = _circles(flat[some], layer[some])
         used = (share > _ON_CIRCLE) & (radius < reach)
-        if used.sum() < _LONG:
-            return None
+        if used.sum() < 3:
+            return
         level = (np.bincount(layer[some], height[some], _SLICES)[used]
                  / np.bincount(layer[some], minlength=_SLICES)[used])
         (x, y), radius = middle[used].T, radius[used]
         line = np.array([_line(level, x), _line(level, y)])
         reach = 1.5 * float(np.median(radius))
-    size = float(np.median(radius))
+    size, long = float(np.median(radius)), float(np.ptp(level))
     off = np.hypot(x - line[0, 0] - line[0, 1] * level, y - line[1, 0] - line[1, 1] * level)
-    scatter = np.abs(np.log(radius / size))
-    fall = abs(_line(level, np.log(radius))[1]) * float(np.ptp(level))
-    if (np.median(off) > _STRAIGHT * size or np.median(scatter) > _EVEN or fall > _FALL
-            or np.linalg.norm(line[:, 1]) > _SLOPE):
-        return None
-    return near, size
+    aside = np.linalg.norm(flat - line[:, 0] - height[:, None] * line[:, 1], axis=1) / size
+    count = np.bincount(layer[near], minlength=_SLICES)
+    shell = np.bincount(layer[(aside > _AROUND[0]) & (aside < _AROUND[1])], minlength=_SLICES)
+    # What a plant's own stem carries begins where the stem forks.
+    carried = height[aside > _AROUND[1]]
+    foot = np.quantile(carried, _FOOT) if len(carried) else level.max()
+    fall, even = _fall(level, np.log(radius))
+    yield Part.judged("post" if size > _THICK_POST else "stake", near, [
+        np.median(off) / size, even, fall * long, fall * long / (even + _EVEN) / 5,
+        np.linalg.norm(line[:, 1]), 1 - used.sum() / _SLICES, 1 - share[used].mean(),
+        np.mean(shell[used] > count[used] / 4), max(foot - level.min(), 0.0) / long])
 
 
-def _wires(points: np.ndarray, placed: np.ndarray, rest: np.ndarray, held: np.ndarray,
-           ) -> list[np.ndarray]:
-    """Indices of the points of each wire among ``rest`` [r], which are on no other support.
-    ``placed`` is the sample, and ``held`` [k, 3] other supports, with the height last."""
+def wires(points: np.ndarray, placed: np.ndarray, held: list[Part]) -> Iterator[Part]:
+    """What may be a wire among points [n, 3] [m] of a scan, which are on no other support;
+    ``placed`` are they with the height last."""
     size = float(np.linalg.norm(np.ptp(placed, axis=0)))
-    if len(rest) < _LONG * _LEAST:
-        return []
+    rest, on = np.ones(len(points), bool), np.zeros(len(points), bool)
+    for part in held:
+        rest[part.points], on[part.points] = False, True
+    rest = np.flatnonzero(rest)
+    if len(rest) < _LEAST:
+        return
     rest = rest[own_order(points[rest])][:_WIRE_POINTS]
-    places, reach, found = placed[rest], _WIRE_SCALE * size, list[np.ndarray]()
-    free, tried, tree = np.ones(len(rest), bool), np.zeros(len(rest), bool), cKDTree(places)
-    supports = cKDTree(held) if len(held) else None
+    places, reach = placed[rest], _WIRE_SCALE * size
+    tried, tree = np.zeros(len(rest), bool), cKDTree(places)
+    supports = cKDTree(placed[on]) if on.any() else None
     for start in range(min(_WIRE_STARTS, len(rest))):
-        if tried[start] or not free[start] or len(found) == _WIRES_MOST:
+        if tried[start]:
             continue
         near = tree.query_ball_point(places[start], reach)
         if len(near) < _LEAST:
             continue
         spread, axes = np.linalg.eigh(np.cov(places[near].T))
-        if spread[1] > _LINE**2 * spread[2] or abs(axes[2, 2]) > _WIRE_SLOPE:
+        if spread[1] > _LINE**2 * spread[2] or abs(axes[2, 2]) > _STEEP:
             continue
         tried[near] = True
-        told = _wire(places, free, supports, placed, places[near].mean(axis=0), axes[:, 2], reach)
-        if told is not None:
-            found.append(told)
-            free &= ~np.isin(rest, told)
-    return found
+        yield from _wire(places, supports, placed, places[near].mean(axis=0), axes[:, 2], reach)
 
 
-def _wire(places: np.ndarray, free: np.ndarray, supports: cKDTree | None, every: np.ndarray,
-          middle: np.ndarray, way: np.ndarray, reach: float) -> np.ndarray | None:
-    """Indices among ``every`` [n, 3] of the wire through ``middle`` [3] along ``way`` [3], seen
-    over ``reach`` [m] to both sides; None if that is none. ``free`` says which ``places`` [r, 3] it
-    may take; all positions have the height last."""
-    way = np.array([way[0], way[1], 0.0]) / np.hypot(way[0], way[1])
+def _wire(places: np.ndarray, supports: cKDTree | None, every: np.ndarray, middle: np.ndarray,
+          way: np.ndarray, reach: float) -> Iterator[Part]:
+    """The wire that may go through ``middle`` [3] along ``way`` [3], seen over ``reach`` [m] to
+    both sides among ``places`` [r, 3] of ``every`` [n, 3]; all positions have the height last."""
+    way = np.array([way[0], way[1], 0.0]) / max(np.hypot(way[0], way[1]), 1e-12)
     aside = np.array([-way[1], way[0], 0.0])
     frame = np.array([way, aside, [0.0, 0.0, 1.0]])
-    own = (places[free] - middle) @ frame.T
+    own = (places - middle) @ frame.T
     # It grows from what is known of it: a line from above, a parabola from the side.
     line, hang, wide = np.zeros(2), np.zeros(3), 0.1 * reach
     low = high = 0.0
@@ -262,7 +279,7 @@ def _wire(places: np.ndarray, free: np.ndarray, supports: cKDTree | None, every:
             np.linalg.norm(off, axis=1) < wide)
         along = own[near, 0]
         if len(along) < _LEAST or np.ptp(along) < 1e-3 * reach:
-            return None
+            return
         line, hang = np.polyfit(along, own[near, 1], 1), np.polyfit(
             along, own[near, 2], 2 if high - low > 6 * reach else 1)
         hang = np.pad(hang, (3 - len(hang), 0))
@@ -270,8 +287,35 @@ def _wire(places: np.ndarray, free: np.ndarray, supports: cKDTree | None, every:
         if along.min() > low - 1e-3 * reach and along.max() < high + 1e-3 * reach and high > low:
             break
         low, high = float(along.min()), float(along.max())
-    return _proven(((every - middle) @ frame.T), line, hang, wide, (low, high), supports,
-                   lambda ends: ends @ frame + middle)
+    own = (every - middle) @ frame.T
+    long, beside_it = high - low, _off(own, line, hang)
+    off = np.linalg.norm(beside_it, axis=1)
+    inside = (own[:, 0] >= low) & (own[:, 0] <= high)
+    near = np.flatnonzero(inside & (off < wide))
+    size = float(np.sqrt(np.mean(off[near]**2))) if len(near) else 0.0
+    if size <= 0 or long <= 0:
+        return
+    slices = np.minimum(((own[:, 0] - low) / long * _SLICES).astype(np.int64), _SLICES - 1)
+    count = np.bincount(slices[near], minlength=_SLICES)
+    shell = inside & (off > _BESIDE[0] * size) & (off < _BESIDE[1] * size)
+    beside = np.bincount(slices[shell], minlength=_SLICES) > count / 4
+    rows = []
+    for number in np.flatnonzero(count >= 3):
+        aside = beside_it[near[slices[near] == number]]
+        bent, thick = aside.mean(axis=0), max(np.sqrt(aside.var(axis=0).sum()), 1e-300)
+        rows.append((number / _SLICES, np.linalg.norm(bent) / thick, np.log(thick)))
+    if len(rows) < 3:
+        return
+    level, ratio, radius = np.array(rows).T
+    fall, even = _fall(level, radius)
+    loose = [0.0]
+    for end, beyond in ((low, own[:, 0].min()), (high, own[:, 0].max())):
+        place = np.array([end, np.polyval(line, end), np.polyval(hang, end)]) @ frame + middle
+        apart = np.inf if supports is None else supports.query(place)[0]
+        loose.append(min(abs(beyond - end), apart) / long)
+    yield Part.judged("wire", near, [
+        100 * size / long, max(-hang[0] * long**2 / 4, 0.0) / size, beside.mean(),
+        np.median(ratio), fall / (even + _EVEN) / 5, 10 * max(loose)])
 
 
 def _off(own: np.ndarray, line: np.ndarray, hang: np.ndarray) -> np.ndarray:
@@ -280,39 +324,10 @@ def _off(own: np.ndarray, line: np.ndarray, hang: np.ndarray) -> np.ndarray:
                             own[:, 2] - np.polyval(hang, own[:, 0])])
 
 
-def _proven(own: np.ndarray, line: np.ndarray, hang: np.ndarray, wide: float,
-            span: tuple[float, float], supports: cKDTree | None,
-            back: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | None:
-    """Indices of the points of a line, if it is thin, even, bare and held as a wire is."""
-    low, high = span
-    long, off = high - low, np.linalg.norm(_off(own, line, hang), axis=1)
-    inside = (own[:, 0] >= low) & (own[:, 0] <= high)
-    near = np.flatnonzero(inside & (off < wide))
-    size = float(np.sqrt(np.mean(off[near]**2))) if len(near) else 0.0
-    if size <= 0 or long < _THIN * size or abs(hang[0]) * long**2 / 4 > _SAG * long or (
-            hang[0] * long**2 / 4 < -size or abs(hang[1]) > _WIRE_SLOPE):
-        return None
-    slices = np.minimum(((own[:, 0] - low) / long * _SLICES).astype(np.int64), _SLICES - 1)
-    rows, beside = [], 0
-    shell = inside & (off > _BESIDE[0] * size) & (off < _BESIDE[1] * size)
-    for number in range(_SLICES):
-        part = near[slices[near] == number]
-        beside += int((shell & (slices == number)).sum() > len(part) / 4)
-        if len(part) >= 3:
-            middle = np.mean(_off(own[part], line, hang), axis=0)
-            rows.append((number / _SLICES, np.linalg.norm(middle),
-                         np.log(max(np.sqrt(np.mean(off[part]**2)), 1e-300))))
-    level, bent, radius = np.array(rows).reshape(-1, 3).T
-    if len(rows) < (1 - _MISSING) * _SLICES or beside > _LATERALS * _SLICES or (
-            np.median(bent) > 2 * _STRAIGHT * size or abs(_line(level, radius)[1]) > 2 * _EVEN
-            or np.median(np.abs(radius - np.median(radius))) > 2 * _EVEN):
-        return None
-    for end, beyond in ((low, own[:, 0] < low - _ENDS * long),
-                        (high, own[:, 0] > high + _ENDS * long)):
-        place = np.array([end, np.polyval(line, end), np.polyval(hang, end)])
-        if beyond.any() and (supports is None or supports.query(back(place))[0] > _ENDS * long):
-            return None
-    return near
+def _fall(level: np.ndarray, thick: np.ndarray) -> tuple[float, float]:
+    """How steeply logarithms of a thickness fall or rise, and their scatter about that."""
+    start, slope = _line(level, thick)
+    return abs(slope), float(np.median(np.abs(thick - start - slope * level)))
 
 
 def _line(level: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -334,17 +349,10 @@ _FLAT, _ELONGATED = 0.01, 0.3  # variance across and along a sheet, over the nex
 _TRIES = 200
 _IN_PLANE = 3  # fewest flat neighbourhoods that span a plane
 _BROAD = 0.11  # smallest standard deviation across a sheet, over the diagonal; leaves have 0.08
+_SURE = 10.0  # standard deviations beyond which nothing is surer
 
 
-class Sheet(NamedTuple):
-    """Mask ``on`` [n] of points on a plane, and the probability that they fill it evenly, as a wall
-    does, and not along lines, as twigs of a flat-grown plant do."""
-
-    on: np.ndarray
-    probability: float
-
-
-def find_sheet(points: np.ndarray, least: float) -> Sheet | None:
+def find_sheet(points: np.ndarray, least: float) -> Part | None:
     """Return the largest plane that points [n, 3] [m] may fill in both directions; None if none has
     ``least`` points."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -380,12 +388,15 @@ def find_sheet(points: np.ndarray, least: float) -> Sheet | None:
     axes = principal_axes(middles[best])
     offset = (points - middle) @ axes.T
     on = np.abs(offset[:, 2]) < thick
-    return None if on.sum() < least else Sheet(on, _even(offset[order[on[order]], :2], diagonal))
+    if on.sum() < least:
+        return None
+    return Part("sheet", np.flatnonzero(on), float(log_ndtr(even := _evenness(
+        offset[order[on[order]], :2], diagonal)) - log_ndtr(-even)))
 
 
-def _even(flat: np.ndarray, diagonal: float) -> float:
-    """The probability that points of a plane, shape [n, 2], fill an area evenly, and are no
-    flat-grown plant.
+def _evenness(flat: np.ndarray, diagonal: float) -> float:
+    """How surely points of a plane, shape [n, 2], fill an area evenly and are no flat-grown plant,
+    in standard deviations.
 
     Twice as far around a point there are four times as many of an even sheet, also beside its
     border, and twice as many of a curve. Each scale between a few points and the sheet's size
@@ -394,7 +405,7 @@ def _even(flat: np.ndarray, diagonal: float) -> float:
     """
     size = flat.std(axis=0).min()
     if size < _BROAD * diagonal:
-        return 0.0
+        return -_SURE
     tree, some = cKDTree(flat), flat[:20 * _SAMPLE:5]
     least = max(3, len(flat) // 200)  # wider than a scanner's lines are apart
     near = float(np.median(tree.query(some, k=least + 1)[0][:, -1]))
@@ -408,7 +419,7 @@ def _even(flat: np.ndarray, diagonal: float) -> float:
             left = left[np.linalg.norm(left - left[0], axis=1) > 4 * near]
         least_even = min(least_even, sum(logs) / max(float(np.linalg.norm(logs)), 1e-12))
         near *= np.sqrt(2)
-    return float(ndtr(least_even))
+    return float(np.clip(least_even, -_SURE, _SURE))
 
 
 # Ground in a scan, rough or on a slope: one layer of points below everything else.
@@ -418,56 +429,47 @@ def _even(flat: np.ndarray, diagonal: float) -> float:
 # is not ground: points continue above it.
 
 _CELL = 0.03  # fraction of the cloud's diagonal
-_LEAST_CELLS, _FILLED = 40, 0.25  # fewest cells of ground, and how much of their box they fill
-_STEEPEST = np.deg2rad(40.0)
-_ROUGH = 0.03  # largest deviation of the ground from its plane, over the diagonal
-_BELOW, _NOTHING = 4.0, 0.03  # standard deviations below the plane; largest fraction of cells there
+_BELOW = 4.0  # standard deviations below the plane, where nothing is
 _LAYER = 3.5  # standard deviations around a cell's ground within which points belong to it
-_ABOVE = 0.3  # largest fraction of cells with points in the next layer (plants)
 _ROUNDS = 10
 
 
-def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray | None:
-    """Mask [n] of the points [n, 3] [m] on the ground below a plant; None if none has ``least``."""
+def find_ground(points: np.ndarray, up: np.ndarray) -> Part | None:
+    """Return what may be the ground below a plant among points [n, 3] [m]; None of few cells."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    up = up / np.linalg.norm(up)
-    across = np.linalg.svd(up[None])[2][1:]
-    flat, height = points @ across.T, points @ up
-    index = np.floor((flat - flat.min(axis=0)) / (_CELL * diagonal)).astype(np.int64)
+    placed = upright(points, up)
+    flat, height = placed[:, :2], placed[:, 2]
+    side = diagonal * max(_CELL, _WIDE / np.sqrt(len(points)))
+    index = np.floor((flat - flat.min(axis=0)) / side).astype(np.int64)
     shape = tuple(index.max(axis=0) + 1)
     where, cell = np.unique(np.ravel_multi_index(tuple(index.T), shape), return_inverse=True)
     count = np.bincount(cell)
     middle = np.stack([np.bincount(cell, values) for values in flat.T], axis=1) / count[:, None]
-    if len(count) < _LEAST_CELLS or middle.std(axis=0).min() < _BROAD * diagonal:
+    size = float(middle.std(axis=0).min())
+    if size <= 0:
         return None
     low = np.full(len(count), np.inf)
     np.minimum.at(low, cell, height)
     plane, rough = _plane(middle, low)
     off = low - plane(middle)
-    slope = float(np.hypot(*(plane(np.eye(2)) - plane(np.zeros((1, 2))))))
-    if (slope > np.tan(_STEEPEST) or rough > _ROUGH * diagonal
-            or np.mean(off < -_BELOW * rough) > _NOTHING):
-        return None
     # Bumps are followed from the lower points of the neighbouring cells; a stem's cell has none
     # lower.
     bumps = np.full(shape, np.nan)
     bumps.ravel()[where] = np.clip(off, -_BELOW * rough, _BELOW * rough)
-    bumps = scipy.ndimage.generic_filter(bumps, _known_median, size=3, mode="constant", cval=np.nan)
-    over = height - plane(flat) - bumps.ravel()[where][cell]
+    around = sliding_window_view(np.pad(bumps, 1, constant_values=np.nan), (3, 3))
+    over = height - plane(flat) - np.nanmedian(around[np.unravel_index(where, shape)], (1, 2))[cell]
     near = over < 2 * _BELOW * rough
+    if not near.any():
+        return None
     thick = 1.4826 * float(np.median(np.abs(over[near] - np.median(over[near]))))
     top = float(np.median(over[near])) + _LAYER * thick
-    ground = over < top
+    ground = over <= top
     next_layer = np.bincount(cell[(over > top) & (over < 2 * top)], minlength=len(count)) > 0
     cells = middle[np.bincount(cell[ground], minlength=len(count)) > 0]
-    is_ground = ground.sum() >= least and np.mean(next_layer) <= _ABOVE and len(cells) * (
-        _CELL * diagonal)**2 > _FILLED * float(np.prod(np.ptp(cells, axis=0)))
-    return ground if is_ground else None
-
-
-def _known_median(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if len(known) else np.nan
+    filled = len(cells) * side**2 / max(float(np.prod(np.ptp(cells, axis=0))), 1e-12)
+    return Part.judged("ground", np.flatnonzero(ground), [
+        30 * rough / diagonal, 10 * np.mean(off < -_BELOW * rough), np.mean(next_layer),
+        1 - min(filled, 1.0), np.log(diagonal / size), 10 / len(count)])
 
 
 def _plane(middle: np.ndarray, low: np.ndarray):
