@@ -48,7 +48,9 @@ CHAPTERS = {
         "must still hold the truth in 95 % of the cases.")),
     "planning": ("Energy, force and paths", (
         "The energy field on poses that it has not seen, the paths against an independent "
-        "optimum, the limits on the full model, and the certified bound.")),
+        "optimum, the limits on the full model, and the certified bound. Up to six jobs shared two "
+        "cores, so the times of two at once are long. The rows of goals and of the paper's arcs "
+        "are of commit f5a04b99; plans ended deeper in a region there.")),
     "robot": ("The robot", (
         "The real client library against the controller in software. No real robot was used.")),
     "worker": ("What a newcomer meets", (
