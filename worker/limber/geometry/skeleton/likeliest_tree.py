@@ -50,8 +50,9 @@ _DEARER = 4.0
 _BESIDE, _KNOWN = 6, 32  # cylinders a point may be of, of so many around it
 _SHARP = (0.5, 0.25, 0.12, 0.06)  # noise across a sensor's sight over that along it, in turn
 _STEEP = 0.3  # least height of a front in radii by which that goes with the radius
-_TABLE, _FACINGS = 48, 9  # distances and angles at which the density of a new twig is known
-
+# Distances and angles at which the density of a new twig is known, and steps of the logarithm of
+# its radius.
+_TABLE, _FACINGS, _LEVEL = 48, 9, 0.05
 
 def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View | None = None,
                progress: Progress = SILENT) -> tuple[Skeleton, float, int, float]:
@@ -302,16 +303,19 @@ class State:
 
 def pruned(state: State) -> State:
     """Leave out the twigs without which the score rises, the largest rise first."""
-    while state.skeleton.branch_count > 1:
-        skeleton, run = state.skeleton, state.skeleton.branch
+    while True:
+        skeleton, run, best = state.skeleton, state.skeleton.branch, state.log
         carriers = np.unique(run[skeleton.parent[1:]][run[1:] != run[skeleton.parent[1:]]])
         bare = np.setdiff1d(np.arange(1, skeleton.branch_count), carriers)
-        scores = [state.without(run == each, 1) for each in bare]
-        if max(scores, default=-np.inf) <= state.log:
-            break
-        state = State.of(skeleton.subset(run != bare[int(np.argmax(scores))]), state.scan,
-                         state.scatter)
-    return state
+        scores = np.array([state.without(run == each, 1) for each in bare])
+        gone, count = np.zeros(skeleton.node_count, bool), 0
+        for each in bare[np.argsort(-scores, kind="stable")][:int((scores > best).sum())]:
+            score = state.without(gone | (run == each), count + 1)
+            if score > best:
+                best, gone, count = score, gone | (run == each), count + 1
+        if not count:
+            return state
+        state = State.of(skeleton.subset(~gone), state.scan, state.scatter)
 
 
 def drawn_back(state: State) -> State:
@@ -340,6 +344,8 @@ def grown(state: State, apart: PointSpacing) -> State:
         for k in np.argsort(-gain, kind="stable"):
             if gain[k] <= 0:
                 break
+            if used[twigs.to[k]]:
+                continue
             nearer = twigs.nearer(int(k), state)
             if not used[nearer].any():
                 used |= nearer
@@ -353,10 +359,12 @@ def grown(state: State, apart: PointSpacing) -> State:
 
 @dataclass(frozen=True)
 class _Twigs:
-    """Straight twigs that may be added, or that lengthen ends: their feet, nodes [t]; their ends
-    [m], shape [t, 3]; radii [m], shape [t]; and what fork or turn at the foot costs [t]."""
+    """Straight twigs that may be added, or that lengthen ends: their feet, nodes [t]; the points
+    that they lead to [t], and where these are [m], shape [t, 3]; radii [m], shape [t]; and what
+    fork or turn at the foot costs [t]."""
 
     foot: np.ndarray
+    to: np.ndarray
     end: np.ndarray
     radius: np.ndarray
     cost: np.ndarray
@@ -382,18 +390,16 @@ class _Twigs:
         mean = (step + np.minimum(length, _SPACING * apart.at(points[to]))) / 2
         bend = turn_cost(np.sum(turn**2, axis=1) / turn_variance(mean, skeleton.radius[foot]))
         goes_on = children[foot] == 0
-        return cls(foot, points[to], skeleton.radius[foot] * np.where(goes_on, 1.0, _TWIG),
+        return cls(foot, to, points[to], skeleton.radius[foot] * np.where(goes_on, 1.0, _TWIG),
                    np.where(goes_on, bend, state.scan.twig_cost))
 
     def gains(self, state: State) -> np.ndarray:
         """By how much each raises the score, shape [t]."""
         scan, skeleton = state.scan, state.skeleton
-        feet, table_of = np.unique(self.foot, return_inverse=True)
-        radius = np.zeros(len(feet))
-        radius[table_of] = self.radius
+        level, table_of = np.unique(np.round(np.log(self.radius) / _LEVEL), return_inverse=True)
         distance = np.append(0.0, np.geomspace(scan.noises[0] / 2, 33 * scan.noises[-1], _TABLE))
         facing = np.linspace(-1, 1, _FACINGS) if scan.sight is not None else np.full(1, np.nan)
-        grid = np.array(np.meshgrid(radius, facing, distance, indexing="ij"))
+        grid = np.array(np.meshgrid(np.exp(level * _LEVEL), facing, distance, indexing="ij"))
         density = densities(grid[2].ravel(), grid[0].ravel(), grid[1].ravel(),
                             np.ones(grid[0].size), scan.noises, scan.power, scan.sharp,
                             ) @ state.scatter.shares

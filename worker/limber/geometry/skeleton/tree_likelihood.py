@@ -116,19 +116,18 @@ class PointLikelihood:
 
     def scattered(self, skeleton: Skeleton, density: np.ndarray) -> Scatter:
         """The likeliest scatter for densities [m, k] across the axes of a tree."""
-        found = []
-        along, elsewhere = density / self.skin(skeleton).sum(), 1 / self.volume
-        for scale in self.noises:
-            ratio = (scale / self.noises)**2
-            shares = ratio**(_FREEDOM / 2) * np.exp(-0.5 * _FREEDOM * ratio)
-            shares /= shares.sum()
-            wood, background = along @ shares, _BACKGROUND
-            for _ in range(_ROUNDS):
-                off = background * elsewhere
-                background = float(np.mean(off / ((1 - background) * wood + off)))
-            log = float(np.log((1 - background) * wood + background * elsewhere).sum())
-            found.append((log, Scatter(float(scale), (1 - background) * shares, background)))
-        return max(found, key=lambda one: one[0])[1]
+        ratio = (self.noises / self.noises[:, None])**2  # [noises, scales]
+        shares = ratio**(_FREEDOM / 2) * np.exp(-0.5 * _FREEDOM * ratio)
+        shares /= shares.sum(axis=0)
+        wood, elsewhere = density / self.skin(skeleton).sum() @ shares, 1 / self.volume
+        background = np.full(len(self.noises), _BACKGROUND)
+        for _ in range(_ROUNDS):
+            off = background * elsewhere
+            background = np.mean(off / ((1 - background) * wood + off), axis=0)
+        log = np.log((1 - background) * wood + background * elsewhere).sum(axis=0)
+        best = int(np.argmax(log))
+        return Scatter(float(self.noises[best]), (1 - background[best]) * shares[:, best],
+                       float(background[best]))
 
     def skin(self, skeleton: Skeleton) -> np.ndarray:
         """Each node's cylinder's share of the points: with power 1 its area [m^2], shape [n]."""
