@@ -280,10 +280,11 @@ def leafy_rows(leafy: list[Outcomes]) -> list[Row]:
 def _things_trial(task: tuple[str, int]) -> dict[str, int]:
     """Things in a scene, and how many of them and of plants' parts are named."""
     scan = scene(task[1], list(SOURCES)[task[1] % len(SOURCES)]).without("sheet", "ground")
-    parts = [(part.probability >= OPEN, scan.overlap(part) > 0.5)
-             for part in find_supports(scan.points, np.array([0.0, 0.0, 1.0]))]
+    found = find_supports(scan.points, np.array([0.0, 0.0, 1.0])) if len(scan.points) else ()
+    parts = [(part.probability >= OPEN, scan.overlap(part) > 0.5) for part in found]
     named, perhaps, false = map(parts.count, ((True, True), (False, True), (True, False)))
-    return {"there": len(scan.kinds) - 1, "named": named, "perhaps": perhaps, "false": false}
+    there = len(np.unique(scan.thing[scan.thing > 0]))
+    return {"there": there, "named": named, "perhaps": perhaps, "false": false}
 
 
 def things_rows(setting: Setting) -> list[Row]:
