@@ -181,8 +181,9 @@ def _with_right_sign(pull: Pull) -> Pull:
     work = work_done(replace(pull, wrenches=pull.wrenches - np.nan_to_num(first[:1])))
     most, least = work.max(), work.min()
     # The noise of each reading, and that of the first one over the whole way.
-    noise = pull.entry.sensor.force_sigma_n * np.hypot(*map(np.linalg.norm, (
-        np.diff(pull.poses[:, :3], axis=0), np.ptp(pull.poses[:, :3], axis=0))))
+    way = pull.poses[:, :3]
+    noise = pull.entry.sensor.force_sigma_n * np.hypot(
+        np.linalg.norm(np.diff(way, axis=0)), np.linalg.norm(np.ptp(way, axis=0)))
     if -least <= 3 * most or -least <= 3 * noise:
         return pull
     seen = (f"{pull.name}: according to the measured force, the branch did {-least:.3g} J of work "

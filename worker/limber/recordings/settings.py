@@ -32,8 +32,7 @@ class ImportSettings(Settings):
         "simulation": ("motion", "swing_start"),
         "noise": ("force_sigma", "torque_sigma", "pull_toml"),
     }
-    common = ("unit", "grasp_point", "grasp_distance", "grasp_mode", "direction", "force_sigma",
-              "cell", "robot", "nominal", "weight")
+    common = ("unit", "grasp_point", "grasp_mode", "cell", "robot", "nominal", "weight")
 
     kind: Annotated[str, OneOf(kind_names)] = Field(
         "auto", description="Kind of SOURCE. auto: determined from its name and content.")

@@ -217,7 +217,7 @@ def _blocks(pull: Pull) -> tuple[np.ndarray, np.ndarray, float, float]:
     parts = [part for part in np.array_split(rows, 60) if len(part)]
     wrenches = np.array([np.median(np.nan_to_num(pull.wrenches[part]), axis=0) for part in parts])
     return (np.array([pull.poses[part[len(part) // 2]] for part in parts]), wrenches,
-            max((np.linalg.norm((each - wrenches[0])[:3]) for each in wrenches), default=0.0),
+            float(max((np.linalg.norm((each - wrenches[0])[:3]) for each in wrenches), default=0)),
             pull.entry.sensor.force_sigma_n / max(len(rows) // 60, 1)**0.5)
 
 

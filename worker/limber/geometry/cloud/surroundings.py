@@ -231,8 +231,8 @@ def _rods(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, start: np.nda
     fall, even = _fall(level, np.log(radius))
     yield Part.judged("post" if size > _THICK_POST else "stake", near, [
         np.median(off) / size, even, fall * long, fall * long / (even + _EVEN) / 5,
-        np.linalg.norm(line[:, 1]), 1 - used.sum() / _SLICES, 1 - share[used].mean(),
-        np.mean(shell[used] > count[used] / 4), max(foot - level.min(), 0.0) / long])
+        float(np.linalg.norm(line[:, 1])), 1 - used.sum() / _SLICES, 1 - share[used].mean(),
+        float(np.mean(shell[used] > count[used] / 4)), max(foot - level.min(), 0.0) / long])
 
 
 def wires(points: np.ndarray, placed: np.ndarray, held: list[Part]) -> Iterator[Part]:
@@ -468,7 +468,7 @@ def find_ground(points: np.ndarray, up: np.ndarray) -> Part | None:
     cells = middle[np.bincount(cell[ground], minlength=len(count)) > 0]
     filled = len(cells) * side**2 / max(float(np.prod(np.ptp(cells, axis=0))), 1e-12)
     return Part.judged("ground", np.flatnonzero(ground), [
-        30 * rough / diagonal, 10 * np.mean(off < -_BELOW * rough), np.mean(next_layer),
+        30 * rough / diagonal, 10 * np.mean(off < -_BELOW * rough), float(np.mean(next_layer)),
         1 - min(filled, 1.0), np.log(diagonal / size), 10 / len(count)])
 
 
