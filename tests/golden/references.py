@@ -315,11 +315,14 @@ def written(reference: dict) -> str:
 
 def main(names: list[str]) -> None:
     """Write the references anew: all, or those whose names begin so."""
-    for name, make in ALL.items():
-        if not names or any(name.removeprefix("stages/").startswith(each) for each in names):
-            path = HERE / f"{name}.json"
-            path.parent.mkdir(exist_ok=True)
-            path.write_text(written(make()), encoding="utf-8")
+    chosen = [name for name in ALL if not names or any(
+        name.removeprefix("stages/").startswith(each) for each in names)]
+    if not chosen:
+        sys.exit(f"No reference's name begins with {' or '.join(names)}.")
+    for name in chosen:
+        path = HERE / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(written(ALL[name]()), encoding="utf-8")
 
 
 if __name__ == "__main__":
