@@ -226,7 +226,7 @@ def test_a_branch_tells_what_it_holds(example):
 @pytest.mark.parametrize("wrong, told", [
     (lambda branch: branch.plan(gaol=(0, 0, 1)), "plan has no 'gaol'. Did you mean goal?"),
     (lambda branch: branch.estimate(methods="x"), "Did you mean method?"),
-    (lambda branch: branch.plan(max_force=-1), "max_force -1: Input should be greater than 0"),
+    (lambda branch: branch.plan(max_force=-1), "max_force -1: it must be greater than 0"),
     (lambda branch: branch.simulate(move=(1, 2)), "move [1, 2]"),
     (lambda branch: branch.load(), "Give wind, snow, fruit or cut"),
     (lambda branch: branch.session(modes="point"), "Did you mean mode?"),

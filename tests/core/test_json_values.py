@@ -1,4 +1,4 @@
-"""The check of values from files: no Boolean is taken for a number."""
+"""The check of values from files: no Boolean is taken for a number, refusals in plain words."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
-from limber.core.json_values import number_array, validated
+from limber.core.json_values import number_array, refusal_of, validated
 from limber.core.settings import Settings, checked_settings
 
 
@@ -48,7 +48,7 @@ def test_a_setting_takes_no_boolean_for_a_number():
     class Made(Settings):
         seed: int = 0
 
-    with pytest.raises(InputError, match="--seed True: Input should be a valid number"):
+    with pytest.raises(InputError, match="--seed True: it must be a number"):
         checked_settings(Made, {"seed": True})
 
 
@@ -71,3 +71,22 @@ def test_an_alignment_of_no_scan(content):
     with pytest.raises(ValidationError):
         validated(Alignment, content)
     assert validated(Alignment, {"scale": 1e-6, "origin": [4e5, 5.8e6, 0]}).scale == 1e-6
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    ({"kind": "c"}, "it must be a or b, not 'c'"), ({"kind": 3}, "it must be a or b, not '3'"),
+    ({"sizes": [1]}, "it is missing"), ({"sizes": [1, 2, 3]}, "it has 3 parts, not 2"),
+    ({"sizes": 1}, "it must be a list"), ({"count": 1.5}, "it must be a whole number"),
+    ({"count": "many"}, "it must be a whole number"), ({"count": 0}, "it must be greater than 0"),
+    ({"part": 3}, "it must be a table of entries"), ({"other": 1}, "no such entry is known")])
+def test_a_refused_value_is_told_in_plain_words(content, said):
+    """Its checker speaks of inputs, tags and dictionaries."""
+    class Refused(BaseModel, extra="forbid"):
+        kind: Literal["a", "b"] = "a"
+        sizes: tuple[float, float] = (0.0, 0.0)
+        count: int = Field(1, gt=0)
+        part: _Part | None = None
+
+    with pytest.raises(ValidationError) as refused:
+        validated(Refused, content)
+    assert refusal_of(refused.value.errors()[0]) == said

@@ -49,7 +49,7 @@ def test_json_of_a_kind_says_where(tmp_path):
     path.write_text("[1, 2.5]")
     assert read_json_as(path, list[float], "numbers") == [1.0, 2.5]
     path.write_text('[1, "x"]')
-    with pytest.raises(InputError, match="1: Input should be a valid number"):
+    with pytest.raises(InputError, match="1: it must be a number"):
         read_json_as(path, list[float], "numbers")
 
 

@@ -77,7 +77,7 @@ def test_frames_go_to_the_flange_and_back(cell_file):
     ("pose = [0.6, 0.1, 0.0, 0.0, 0.0, 1.2]", "pose = [0.6, 0.1, nan, 0, 0, 1.2]",
      r"line 8: base\.pose.*finite"),
     ("mass_kg = 0.9", "mass_kg = 9.0", "ur5e carries at most 5 kg"),
-    ("mass_kg = 0.9", "mass = 0.9", r"line 13: tool\.mass: Extra"),
+    ("mass_kg = 0.9", "mass = 0.9", r"line 13: tool\.mass: no such entry"),
     ("hard_force_n = 15.0", "hard_force_n = 5.0", r"line 16: limits: soft_force_n must be less"),
     ("high_m = [0.5, 0.5, 1.0]", "high_m = [0.5, -0.5, 1.0]", "workspace: low_m must be below"),
     ("[base]", "[base", r"line 7"),

@@ -353,11 +353,11 @@ def test_every_command_is_understood(command):
 
 
 @pytest.mark.parametrize(("line", "words"), [
-    (b'{"command": "move", "id": 1e400, "pose": [0, 0, 0, 0, 0, 0]}', "integer"),
+    (b'{"command": "move", "id": 1e400, "pose": [0, 0, 0, 0, 0, 0]}', "whole number"),
     (b'{"command": "move", "id": ' + b"9" * 5000 + b', "pose": [0, 0, 0, 0, 0, 0]}', "JSON"),
     (b'{"command": "move", "pose": [NaN, 0, 0, 0, 0, 0]}', "finite"),
     (b'{"command": "move", "pose": [1e300, 0, 0, 0, 0, 0]}', "1000"),
-    (b'{"command": "move", "pose": [0, 0, 0, 0, 0, 0], "id": true}', "integer"),
+    (b'{"command": "move", "pose": [0, 0, 0, 0, 0, 0], "id": true}', "whole number"),
     (b"[" * 100_000, "JSON"),
     (b"\xff\xfe\x00", "JSON"),
     (b"{}", "command"),

@@ -102,8 +102,9 @@ def test_a_file_of_edits_is_read_or_its_fault_told(tmp_path) -> None:
     edits = _edits({"do": "root", "at": (0, 0, 0.4)}, {"do": "delete", "at": (0.1, 0, 0.2)})
     path.write_text(edits_text(edits))
     assert read_edits(path) == edits
-    for text, told in (("{", "JSON"), ('[{"do": "cut", "at": [0, 0, 0]}]', "edit 1"),
-                       ('[{"do": "move", "at": [0, 0, 0]}]', "edit 1: to"),
+    for text, told in (("{", "JSON"), ('[{"do": "cut", "at": [0, 0, 0]}]',
+                                       "edit 1: it must be add, .* or confirm, not 'cut'"),
+                       ('[{"do": "move", "at": [0, 0, 0]}]', "edit 1: move.to: it is missing"),
                        ('[{"do": "root", "at": [0, 0, NaN]}]', "edit 1|JSON")):
         path.write_text(text)
         with pytest.raises(InputError, match=told):

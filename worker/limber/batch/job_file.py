@@ -24,7 +24,7 @@ from limber.core.errors import BranchFolderError, Command, InputError, LimberErr
 from limber.core.files.atomic import require_file
 from limber.core.files.reading import read_text, read_toml
 from limber.core.files.safe_names import same_named
-from limber.core.json_values import plain
+from limber.core.json_values import plain, refusal_of
 from limber.core.processes import Limits
 from limber.core.settings import nearest
 from limber.core.units import in_unit
@@ -318,11 +318,12 @@ class _Reader:
                 for one in error.errors():
                     key = str(one["loc"][0]) if one["loc"] else ""
                     unit = fields.get(key, {}).get("unit")
-                    seen = "" if one["type"] == "missing" else f", not {one['input']!r}"
-                    why = one.get("ctx", {}).get("error", one["msg"])
+                    why = refusal_of(one)
+                    said = "" if one["type"] == "missing" or ", not " in why else (
+                        f", not {one['input']!r}")
                     if key not in refused:
                         self.refuse(given[key][0] if key in given else (*key_path, key), (
-                            f"{name} {key}: {why}{seen}" + (f" [{unit}]." if unit else ".")))
+                            f"{name} {key}: {why}{said}" + (f" [{unit}]." if unit else ".")))
         self.check_results(branch, tasks, {*given}, key_path)
         return tasks
 

@@ -21,7 +21,7 @@ from limber.cell.urdf_arm import is_file
 from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
-from limber.core.json_values import plain, validated
+from limber.core.json_values import plain, refusal_of, validated
 from limber.core.numerics.rigid import inverted, matrices
 
 RIGID_N_PER_M = 2e5
@@ -361,7 +361,7 @@ def write_cell(path: str | Path, cell: Cell) -> None:
 
 def _problem_text(path: Path, item: Mapping[str, Any]) -> str:
     key = ".".join(str(part) for part in item["loc"])
-    message = item["msg"].removeprefix("Value error, ")
+    message = refusal_of(item)
     # An error that several entries cause together begins with the name of one of them.
     first = re.match(r"[\w.]+", message)
     named = tuple(first[0].split(".")) if first and not item["loc"] else item["loc"]

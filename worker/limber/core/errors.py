@@ -123,6 +123,11 @@ def _from_json(option: str | None, value: Any, command: str | None, text: str) -
     return Command(command, *text.strip("`").split()[1 + len(command.split()):])
 
 
+def _sentence(text: str) -> Text:
+    """A text with its full stop: a solver's or a parser's own words often end without."""
+    return Text(text, "." if text and text[-1] not in ".?!:" else "")
+
+
 class LimberError(Exception):
     """Base of all errors that a user can see. Not raised itself."""
 
@@ -134,7 +139,7 @@ class LimberError(Exception):
         is what was done before."""
         super().__init__(seen, why, *fix)
         self.result = result
-        self.seen, self.why, self.fix = Text(seen), Text(why), Text(*fix)
+        self.seen, self.why, self.fix = _sentence(seen), _sentence(why), Text(*fix)
         self.place = self.seen.place
 
     def __str__(self) -> str:

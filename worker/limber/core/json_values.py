@@ -1,6 +1,7 @@
 """Values in JSON form, and their check."""
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import reduce
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails
+
+from limber.core.errors import Text
 
 Content = TypeVar("Content")
 
@@ -88,6 +91,44 @@ def validated(kind: type[Content], content: Any) -> Content:
             type="float_type", loc=place, input=reduce(lambda held, key: held[key], place,
                                                        content))])
     return made
+
+
+def first_refusal(error: ValidationError) -> str:
+    """Return where content is wrong first, and why, in plain words."""
+    first = error.errors(include_url=False)[0]
+    return Text.joined(": ", [*[".".join(map(str, first["loc"]))] * bool(first["loc"]),
+                              refusal_of(first)])
+
+
+def refusal_of(problem: Mapping[str, Any]) -> Text:
+    """Return in plain words why a value was refused; ``problem`` is one of a ValidationError's
+    ``errors()``."""
+    about, kind = problem.get("ctx", {}), problem["type"]
+    if isinstance(cause := about.get("error"), ValueError):
+        return Text(*cause.args)
+    if known := re.findall("'([^']*)'", about.get("expected_tags", about.get("expected", ""))):
+        given = str(about.get("tag", problem["input"]))
+        return Text(f"it must be {', '.join(known[:-1])} or {known[-1]}, not {given!r}"
+                    if len(known) > 1 else f"it must be {known[0]}, not {given!r}")
+    if "actual_length" in about:
+        return Text(f"it has {about['actual_length']} parts, not "
+                    f"{about.get('max_length', about.get('min_length'))}")
+    if kind == "union_tag_not_found":
+        return Text(about["discriminator"].strip("'"), " is missing")
+    said = problem["msg"].replace("Input should", "it must")
+    return Text(_REFUSALS.get(kind.removesuffix("_parsing").removesuffix("_type"))
+                or said.replace("greater than or equal to", "at least").replace(
+                    "less than or equal to", "at most"))
+
+
+_REFUSALS = {"missing": "it is missing", "extra_forbidden": "no such entry is known",
+             "float": "it must be a number", "int": "it must be a whole number",
+             "int_from_float": "it must be a whole number",
+             "bool": "it must be true or false", "string": "it must be a text",
+             "list": "it must be a list", "tuple": "it must be a list",
+             "dict": "it must be a table of entries", "model": "it must be a table of entries",
+             "model_attributes": "it must be a table of entries"}
+"""What is said of a refused value, by the kind of error."""
 
 
 def _boolean_as_number(content: Any, made: Any) -> tuple[str | int, ...] | None:

@@ -25,7 +25,7 @@ from pydantic import (
 from pydantic_core import core_schema
 
 from limber.core.errors import InputError, Option, Text
-from limber.core.json_values import validated
+from limber.core.json_values import refusal_of, validated
 from limber.core.units import in_unit
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -232,9 +232,7 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
     if missing:
         return _missing(model, values, missing)
     first = error.errors()[0]
-    cause = first.get("ctx", {}).get("error")
-    message = (Text(*cause.args) if isinstance(cause, ValueError) else
-               "it must be a number" if first["type"].endswith("_parsing") else first["msg"])
+    message = refusal_of(first)
     if not first["loc"]:
         # It concerns several values, and names them.
         return InputError(Text(message, "."), "", "See the options' help.")

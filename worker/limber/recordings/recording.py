@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.reading import checked_as, read_toml, toml_content
-from limber.core.json_values import plain, validated
+from limber.core.json_values import first_refusal, plain, validated
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.settings import possible_time
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -312,9 +312,7 @@ def _checked(content: dict[str, Any], where: str) -> PullEntry:
     try:
         return validated(PullEntry, content)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{where}: {key}: {first['msg']}.",
+        raise InputError(f"{where}: {first_refusal(error)}.",
                          "The pull cannot be read without a valid entry.",
                          "Correct the entry.") from error
 

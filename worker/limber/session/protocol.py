@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from limber.core.errors import InputError
-from limber.core.json_values import json_object
+from limber.core.json_values import first_refusal, json_object
 from limber.core.settings import GraspMode, Settings
 
 PROTOCOL = 2
@@ -196,11 +196,9 @@ def parse_command(line: bytes) -> Command:
     try:
         return _COMMANDS.validate_json(line, strict=True)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
         raise NotUnderstood(
             f"Not understood: {line[:200].decode(errors='replace').strip()}",
-            f"{key + ': ' if key else ''}{first['msg']}.", "",
+            f"{first_refusal(error)}.", "",
             reply_id=_id_of(line)) from None
 
 

@@ -15,7 +15,7 @@ from limber.core.alignment import Alignment
 from limber.core.errors import BranchFolderError, Command, InputError
 from limber.core.files.reading import read_json
 from limber.core.files.safe_names import relative_name
-from limber.core.json_values import plain, validated
+from limber.core.json_values import first_refusal, plain, validated
 from limber.core.machine_errors import machine_error
 from limber.version import VERSION
 
@@ -105,10 +105,8 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         manifest = validated(Manifest, content)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
         raise BranchFolderError(
-            f"{path}: {key or 'content'}: {first['msg']}.", "The manifest is damaged.",
+            f"{path}: {first_refusal(error)}.", "The manifest is damaged.",
             "Restore it from a copy, or reconstruct into a new folder.") from error
     _require_inside(path, manifest)
     return manifest

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from limber.core.errors import InputError
 from limber.core.files.atomic import require_no_pipe
-from limber.core.json_values import LARGEST_NUMBER, validated
+from limber.core.json_values import LARGEST_NUMBER, first_refusal, validated
 
 Content = TypeVar("Content")
 
@@ -103,9 +103,7 @@ def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what:
         return (TypeAdapter(kind).validate_json(json.dumps(content), strict=True) if strict
                 else validated(kind, content))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: {key + ': ' if key else ''}{first['msg']}.",
+        raise InputError(f"{path}: {first_refusal(error)}.",
                          f"{what[0].upper()}{what[1:]} was expected.",
                          "It is damaged, or was written by another program. Make it again.",
                          ) from error

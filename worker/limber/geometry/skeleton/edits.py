@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from limber.core.alignment import Alignment
 from limber.core.errors import Command, InputError, Text
 from limber.core.files.reading import read_json
-from limber.core.json_values import validated
+from limber.core.json_values import refusal_of, validated
 from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
 
 Place = tuple[float, float, float]
@@ -124,11 +124,10 @@ def read_edits(path: Path) -> list[Edit]:
         first = error.errors()[0]
         key = first["loc"]
         where = f"edit {key[0] + 1}: " if key and isinstance(key[0], int) else ""
-        field = ".".join(str(part) for part in key[2:])
+        field = ".".join(str(part) for part in key[1:])
         raise InputError(
-            f"{path}: {where}{field + ': ' if field else ''}{first['msg']}.",
-            "Edits are a JSON list of objects such as {\"do\": \"delete\", \"at\": [x, y, z]}. The "
-            "field do is add, move, delete, merge, bridge, split, root, radius or confirm.",
+            f"{path}: {where}{field + ': ' if field else ''}{refusal_of(first)}.",
+            "Edits are a JSON list of objects such as {\"do\": \"delete\", \"at\": [x, y, z]}.",
             "Correct the file. Give positions in the coordinates of the scan file.") from error
 
 

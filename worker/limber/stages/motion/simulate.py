@@ -170,7 +170,8 @@ def _simulated(asked: Simulate, progress: Progress, along: PoseTable | None,
         raise ConvergenceError(
             Text("The branch could not follow the motion: ", motion.message),
             f"{result['frame_count']} frames up to the last valid state are in "
-            f"frames/{asked.name}.pc2. The grasp force there is {result['grasp_force_n']} N.",
+            f"frames/{asked.name}.pc2. The grasp force there is "
+            f"{np.linalg.norm(result['grasp_force_n']):.3g} N.",
             "Pull less far, or check units and Young's modulus.")
     return branch.manifest.stages[key].result
 

@@ -81,7 +81,7 @@ class ReviewSkeleton(BranchStage):
                 "point_masses.json", EDITS),
         found=("{node_count:count} nodes in {branch_count:#branch/branches}, {length_m:m}; the "
                "mesh is {mesh}.", _doubtful_line),
-        then="limber virtual-pull {branch_folder}", step="skeleton", label="Review and Edit")
+        then="limber suggest-pull {branch_folder}", step="skeleton", label="Review and Edit")
 
     edits: Path | None = given(
         "Edits (JSON) that replace those of the branch. An empty list removes all.", common=True)

@@ -74,7 +74,7 @@ class Mesh(MeshSurfaceSettings, Repeatable):
         found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
                "{radius_min_m:m} to {radius_max_m:m}.",
                "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}."),
-        then="limber virtual-pull {output}", step="mesh", label="Mesh a Closed Surface")
+        then="limber suggest-pull {output}", step="mesh", label="Mesh a Closed Surface")
 
     surface: Path = argument(
         f"A closed surface: {listed(SURFACES.readers())}; a .csv of sections along an axis from "

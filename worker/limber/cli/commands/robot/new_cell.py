@@ -11,6 +11,7 @@ from limber.cell.known_arms import arm_named
 from limber.cell.ur_arms import NAMES
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
+from limber.core.json_values import refusal_of
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, Tool, argument, given
@@ -57,7 +58,7 @@ class NewCell(Tool):
         except ValidationError as error:
             wrong = error.errors()[0]
             raise InputError(f"{wrong['input']!r} is not possible for {wrong['loc'][0]}: "
-                             f"{wrong['msg']}.", "", "Give another value.") from error
+                             f"{refusal_of(wrong)}.", "", "Give another value.") from error
         arm = arm_named(present(told.model, "model"))
         kind = told.sensor or ("controller" if arm.measures_force else "ft300")
         force, torque = _RATED.get(arm.name if kind == "controller" else kind[:5], (100.0, 10.0))
