@@ -9,10 +9,12 @@ from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays, Quantity, limited
+from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import Goal, allowed_points, over_limits, unit_hint
 from limber.planning.settings import PlanSettings
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
+_ENDS = 500  # poses in the goal to which a start has its distance
 
 
 UNPROVEN = "but it is not proven that none exists"
@@ -139,14 +141,19 @@ def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarr
 
 
 def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: int) -> np.ndarray:
-    """Draw a start evenly from the allowed region, at least half the largest deflection from rest
-    and the goal's middle, and a quarter from its border. The paper does not say how it drew its
-    "randomized initial configurations". NoPathError if none was found."""
+    """Draw a start evenly from the allowed region, the grasp at least half the largest deflection
+    from rest and from the goal. The paper does not say how it drew its "randomized initial
+    configurations", but its paths are about as long as its branches. NoPathError if none was
+    found."""
     generator = np.random.default_rng([seed, 7])
     points = field.region.draw(4000, generator)
     half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
+    # By the grasp's way: the tip moves farther, and from just outside its goal there is little to
+    # save.
+    ends = goal.guess(field, _ENDS, np.random.default_rng(0))
+    ends = ends[goal.excess(field, ends) <= 0.0]
     fit = np.linalg.norm(points - field.rest, axis=1) >= half
-    fit &= goal.excess(field, points) >= max(half - goal.tolerance, 0.5 * half)
+    fit &= nearest_of(points, ends)[0] >= half if len(ends) else goal.excess(field, points) > 0.0
     fit &= allowed_points(points, Limits.of(settings).on(field))
     if not fit.any():
         raise NoPathError("No allowed deformed start is far from rest and far from the goal.",

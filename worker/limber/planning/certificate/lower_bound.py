@@ -223,14 +223,13 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     open_cells = ground.open_cells[box]
     distance = spread(open_cells.shape, cells - low, away)
     filled = np.nan_to_num(distance, nan=np.inf)
-    growth, slope = _growth(distance, edges)
+    reach, slope, is_exact = _growth(distance, edges)
     corners = tuple(map(slice, low, high + 1))
     rate = np.where(ground.level[box], ground.floor,
                     corner_values(ground.rate[corners]).mean(axis=0))
     cost = _cost_left(distance / slope, goal.tolerance / slope, rate, edges)
-    half = 0.5 * float(np.linalg.norm(edges))
-    touching = open_cells & (filled <= growth * half)
-    inside = filled < -growth * half
+    touching = open_cells & (filled <= reach)
+    inside = filled < -reach
 
     def whole(part: np.ndarray) -> np.ndarray:
         out = np.zeros(shape, part.dtype)
@@ -238,13 +237,13 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
         return out
     # A grasp's distance is exact, and used farther than the next cells. A target's is not: where
     # the target moves far with the grasp, cells far from the goal would count as near it.
-    known = filled <= 3.0 * half if growth.max() <= 1.0 else (
-        scipy.ndimage.binary_dilation(touching, np.ones((3, 3, 3))) & np.isfinite(distance))
-    # A cell of the next grid queries up to 4 of its edges away, 7 times half its diagonal; its
-    # centre is within ``half`` of this one's.
+    # Cells next to closed ones count too: from a deep one left out, a cost below 0 would spread.
+    known = filled <= 3.0 * reach if is_exact else (
+        scipy.ndimage.binary_dilation(filled <= reach, _NEAR) & np.isfinite(distance))
+    # A cell of the next grid queries up to 4 of its edges away; its centre is in this one.
     return AboutGoal(whole(known), whole(np.nan_to_num(cost)),
                      whole(inside), whole(touching & ~inside), bool(touching.any()),
-                     whole(filled <= growth * 8.0 * half))
+                     whole(filled <= 9.0 * reach))
 
 
 def short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,
@@ -277,9 +276,10 @@ def _cost_left(length: np.ndarray, depth: np.ndarray, rate: np.ndarray, edges: n
     return flat * np.where(length > 0.0, np.clip(mid_rate, 0.5 * rate, 1.5 * rate), rate)
 
 
-def _growth(distance: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The largest growth of the goal's distance per metre in each cell, and a smooth mean to divide
-    by. It needs no reserve: the sub-solution is scaled down wherever it is too steep."""
+def _growth(distance: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    """By how much the goal's distance grows from a cell's centre to its corners at most, a smooth
+    mean of its growth per metre to divide by, and whether it is exact. The mean needs no reserve:
+    the sub-solution is scaled down wherever it is too steep."""
     ahead, behind = [], []
     for axis, edge in enumerate(edges):
         unknown = np.full_like(distance.take([0], axis), np.nan)
@@ -290,14 +290,16 @@ def _growth(distance: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.nda
     known = np.isfinite([ahead, behind])
     steepest = np.abs(either).max(axis=0)
     if steepest.max() <= 1.0 + 1e-9:  # a grasp's distance: by at most a metre per metre
-        return np.ones_like(distance), np.ones_like(distance)
+        return (np.full_like(distance, 0.5 * np.linalg.norm(edges)), np.ones_like(distance), True)
+    # A target's by the field's rate, and a reserve. Across the surface it grows most, and there a
+    # cell is thin.
+    reach = scipy.ndimage.maximum_filter(0.5 * np.einsum("i,i...", edges, steepest), 3)
     growth = scipy.ndimage.maximum_filter(np.linalg.norm(steepest, axis=0), 3)
     mean = np.linalg.norm(either.sum(axis=0) / np.maximum(known.sum(axis=0), 1), axis=0)
     weight = known.any(axis=(0, 1)).astype(float)
     smooth = scipy.ndimage.uniform_filter(mean * weight, 3) / np.maximum(
         scipy.ndimage.uniform_filter(weight, 3), 1e-9)
-    # A target's by the field's rate, and a reserve.
-    return _BEYOND * growth, np.maximum(smooth, _FLAT * growth) + 1e-12
+    return _BEYOND * reach, np.maximum(smooth, _FLAT * growth) + 1e-12, False
 
 
 _MOST_CELLS = 400_000  # in any grid's tube; a further refinement is skipped

@@ -25,79 +25,13 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify_all
-from limber.planning.cost import EdgeWeights, arc_lengths, edge_cost, path_cost, resample
-from limber.planning.field.energy_field import EnergyField, FieldArrays, Quantity, limited
+from limber.planning.cost import EdgeWeights, arc_lengths, resample
+from limber.planning.field.energy_field import EnergyField, Quantity, limited
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.path_problem import BlockedError, GentleProblem, no_path_error, not_found
 from limber.planning.planners.least_violation import easiest_path
 
-# From the corners of a tree to a path for a robot: shortcuts, then the nearest local optimum.
-#
-# The same steps for the baseline and for D-RRT*, so that they differ by their costs and not by the
-# luck of sampling.
-
-_POLISH_POINTS = 40  # corners of the path while it is smoothed
 _MIN_GAP = 1e-9  # [m] keeps the length's gradient finite where two corners meet
-
-
-def shortcut(path: np.ndarray, field: FieldArrays, weights: EdgeWeights, *, attempts: int,
-             seed: int) -> np.ndarray:
-    """Return the polyline after random shortcuts that lower the cost, evenly spaced [n, 3]."""
-    generator = np.random.default_rng([seed, 1])
-    path = resample(path, weights.step)
-    # Spans shrink: long ones straighten, short ones round the corners that the long ones leave.
-    for span in np.geomspace(1.0, 0.05, max(attempts, 1))[:attempts]:
-        first = int(generator.integers(len(path)))
-        last = first + max(int(span * generator.uniform() * len(path)), 2)
-        if last >= len(path):
-            continue
-        old = path_cost(path[first:last + 1], field, weights)
-        new = edge_cost(path[first], path[last], field, weights)
-        if new < old:
-            straight = np.linspace(path[first], path[last], last - first + 1)
-            path = np.concatenate([path[:first], straight, path[last + 1:]])
-    return resample(path, weights.step)
-
-
-def slide_end(path: np.ndarray, goals: np.ndarray, limits: FieldArrays, weights: EdgeWeights,
-              ) -> np.ndarray:
-    """Return the path bent to end in the cheapest of ``goals`` [g, 3]. A tree ends where its
-    samples fell; all of the goal is equally good, but the paths to it are not."""
-    part = (arc_lengths(path) / max(arc_lengths(path)[-1], _MIN_GAP))[:, None]
-    best, least = path, path_cost(path, limits, weights)
-    for goal in goals:
-        bent = path + part * (goal - path[-1])
-        if (cost := path_cost(bent, limits, weights)) < least:
-            best, least = bent, cost
-    return best
-
-
-def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
-           weights: EdgeWeights) -> np.ndarray:
-    """Move a path [n, 3] with fixed ends to the nearest optimum, by L-BFGS with the gradient of the
-    field alone: of the way there, the farthest tenth that is allowed and cheaper is taken."""
-    spacing = max(weights.step, np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-                  / _POLISH_POINTS)
-    corners = resample(path, spacing)
-    if len(corners) < 3:
-        return path
-    inner = corners[1:-1].shape
-
-    def cost(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        moved = np.concatenate([corners[:1], flat.reshape(inner), corners[-1:]])
-        value, gradient = smooth_cost(moved, energy_field, weights)
-        return value, gradient[1:-1].ravel()
-
-    best = scipy.optimize.minimize(cost, corners[1:-1].ravel(), jac=True, method="L-BFGS-B",
-                                   options={"maxiter": 200}).x.reshape(inner)
-    before = path_cost(path, limits, weights)
-    for share in np.linspace(1.0, 0.1, 10):
-        moved = corners.copy()
-        moved[1:-1] += share * (best - corners[1:-1])
-        moved = resample(moved, weights.step)
-        if path_cost(moved, limits, weights) < before:
-            return moved
-    return path
 
 
 def smooth_cost(path: np.ndarray, energy_field: EnergyField, weights: EdgeWeights,

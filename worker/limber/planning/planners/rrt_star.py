@@ -47,14 +47,12 @@ class Search:
         iterations: Samples drawn.
         reach: Longest edge, as a fraction of the box's diagonal.
         goal_bias: Fraction of samples that are drawn from the goal region.
-        shortcuts: Attempts to shorten the found path.
         seed: Seed of all random numbers.
     """
 
     iterations: int = 5000
     reach: float = 0.25
     goal_bias: float = 0.05
-    shortcuts: int = 400
     seed: int = 0
 
 

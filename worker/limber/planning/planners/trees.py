@@ -1,8 +1,8 @@
 """RRT* (Karaman and Frazzoli 2011) over grasp positions, by the requested planner.
 
 ``ompl`` is the Open Motion Planning Library's, kept as the widely known reference; ``own`` replaces
-it where OMPL has no wheel. Paths end with shortcuts that lower the cost; OMPL's other simplifiers
-ignore it.
+it where OMPL has no wheel. Paths are refined as the gentle one is, so that the two differ by their
+costs and not by the luck of sampling; OMPL's simplifiers ignore the cost.
 """
 
 import math
@@ -13,8 +13,8 @@ import numpy as np
 from limber.core.errors import MissingDependencyError, NoPathError, Option
 from limber.core.optional import how_to_install
 from limber.core.progress import SILENT, Progress
-from limber.planning.cost import edge_cost, path_cost
-from limber.planning.planners.refine import polish, shortcut, slide_end
+from limber.planning.cost import edge_cost, path_cost, resample
+from limber.planning.planners.refine import refine
 from limber.planning.planners.rrt_star import (
     PathProblem,
     Search,
@@ -183,8 +183,8 @@ def chosen_engine(engine: str) -> str:
 
 @dataclass(frozen=True)
 class FoundPath:
-    """A path of even positions [n, 3] [m]. ``tree_cost`` and ``raw`` [k, 3] are before shortcuts
-    (None: no tree); ``history`` has ``{"iteration", "cost"}`` of the best so far."""
+    """A path of even positions [n, 3] [m]. ``tree_cost`` and ``raw`` [k, 3] are before it was
+    refined (None: no tree); ``history`` has ``{"iteration", "cost"}`` of the best so far."""
 
     points: np.ndarray
     cost: float
@@ -208,10 +208,7 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
                           Option("max_energy"), " or ",
                           Option("max_force"), ".")
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
-    points = shortcut(raw, problem.limits, problem.weights, attempts=search.shortcuts,
-                      seed=search.seed)
-    points = slide_end(points, problem.goals, problem.limits, problem.weights)
-    points = polish(points, problem.energy_field, problem.limits, problem.weights)
+    points, _ = refine(resample(raw, problem.weights.step), problem)
     return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
                      found.history, engine, raw, found.tree)
 
@@ -220,6 +217,6 @@ def found_again(found: FoundPath, problem: PathProblem) -> FoundPath | None:
     """Return a found path on a field with more samples; None if it is not allowed there."""
     points = found.points
     if problem.weights.energy > 0.0:
-        points = polish(points, problem.energy_field, problem.limits, problem.weights)
+        points, _ = refine(points, problem)
     cost = float(path_cost(points, problem.limits, problem.weights))
     return replace(found, points=points, cost=cost) if np.isfinite(cost) else None
