@@ -202,5 +202,5 @@ def test_a_limit_that_a_known_path_keeps_is_never_proven_impossible(planned_bran
     start, end = way.poses[[0, -1], :3]
     goal = grasp_goal(tuple(map(float, end)), 0.005)
     found = judge(GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
-                                sure=limits.on(field, SURELY)), 40_000)
+                                sure=limits.on(field, SURELY)))
     assert not found.proven

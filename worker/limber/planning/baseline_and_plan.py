@@ -279,7 +279,6 @@ _SHARES = (1.0, 0.5, 0.2)  # fractions of the margins that are tried
 _AT_START = 1e-4  # [m] distance at which the approach ends
 NOTHING_ASKED = "none"
 """The engine of paths that stay where they are."""
-_FEW_CELLS = 30_000  # they prove in a second or two that a limit is far too low
 _ANY = 1e6  # gap: any path suffices
 
 
@@ -361,7 +360,7 @@ def _closed_by_field(field: EnergyField, start: np.ndarray, goal: Goal, limits: 
         return None, True
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
                             sure=asked.on(field, SURELY))
-    verdict = judge(problem, _FEW_CELLS)
+    verdict = judge(problem)
     if not verdict.proven:
         closed = not_found(problem, "By the energy field there is none, but its error leaves the "
                            "question open.") if verdict.closed_by_field else None

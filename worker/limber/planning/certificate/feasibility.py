@@ -50,18 +50,16 @@ class Verdict:
     nearest: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
 
-def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
+def judge(problem: GentleProblem) -> Verdict:
     """Return a path on the field, or whether it is proven that none exists; undecided if that would
-    take more than ``most_cells`` at once."""
-    most = most_cells or _MOST_CELLS
-    exact = replace(problem, sure=problem.limits)
-    on_field = _judged(exact, most, is_exact=True)
+    take too many cells at once."""
+    on_field = _judged(replace(problem, sure=problem.limits), is_exact=True)
     if not on_field.proven:
         return on_field
-    return replace(_judged(problem, most), closed_by_field=True)
+    return replace(_judged(problem), closed_by_field=True)
 
 
-def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> Verdict:
+def _judged(problem: GentleProblem, is_exact: bool = False) -> Verdict:
     """Cut cells until they prove that no path keeps the sure limits and comes within the field's
     error of the goal (0 if ``is_exact``), or contain a path, or are too many."""
     cells, wall = Cells.over(problem.energy_field), _Wall(problem)
@@ -101,7 +99,7 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
         uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
                                  (bends / problem.goal.tolerance)[open_cells][ends].sum(axis=0))
         parts = np.where(uncertainty >= _DOUBTED * uncertainty.max(), 2, 1)
-        if connected.sum() * parts.prod() > most_cells:
+        if connected.sum() * parts.prod() > _MOST_CELLS:
             return Verdict(cells.edges)
         cells = cells.take(connected).cut(parts)
 

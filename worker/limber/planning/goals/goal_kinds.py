@@ -1,7 +1,7 @@
 """The kinds of goals, and the one requested by a plan's settings."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -195,13 +195,12 @@ class CellGoal(Goal):
         return super().uncertainty(field, points)
 
     def drawn_in(self, states: States) -> Self:
-        found = super().drawn_in(states)._met(states)
-        if not len(found.taken) or not self._cause(self.point.in_states(states)[-1],
-                                                   states.displacements[-1]):
+        found = super().drawn_in(states)._told(states.positions, self._causes(states))
+        if not len(found.taken) or not found._causes(states.take(np.array([-1])))[0]:
             return found
         # What the field takes for valid may not be: the branch model says what is.
         chosen = found.taken[_far_apart(found.taken, _SOLVED)]
-        known = replace(found, taken=_NOWHERE)._solved(chosen)
+        known = replace(found, taken=_NOWHERE)._told(chosen, self._by_model(chosen))
         return replace(known if len(known.taken) else found, caution=found.caution * _WARIER)
 
     def require_end(self, grasp_model: GraspModel, states: States) -> None:
@@ -209,81 +208,67 @@ class CellGoal(Goal):
                                 self._surface(states.displacements[-1]))
 
     def learnt(self, field: EnergyField) -> Self:
-        """Return the goal with the results at poses of the field. NoPathError if the target is in
-        the region at some of them, and valid at none."""
+        """Return the goal with the results at poses of the field, for a view those of the branch
+        model, and between them. NoPathError if the target is in the region at some of them, and
+        valid at none."""
+        tell, pairs, halvings = self._by_model, _SOLVED_PAIRS, _SOLVED_HALVINGS
         if self.cell_place.of_surface:
-            found = self._of_states(field)
+            points = field.samples.positions[
+                self.region.distance(self.point.in_states(field.samples)) <= 0.0]
+            points = points[_far_apart(points, _SOLVED)] if len(points) else points
         else:
+            def tell(grasps: np.ndarray) -> list[str | None]:
+                return [self._cause(one, None) for one in self.point.at(field, grasps)]
+            pairs, halvings = _PAIRS, _PAIR_HALVINGS
             points = np.concatenate([field.rest[None], field.region.draw(
                 _PLACES_DRAWN, np.random.default_rng(0))])
             points = points[Goal.excess(self, field, points) <= 0.0][:_ASKED]
-            found = self._asked(points, self.point.at(field, points), None)._sharpened(
-                lambda middle: [self._cause(one, None) for one in self.point.at(field, middle)],
-                _PAIRS, _PAIR_HALVINGS)
+        found = self._told(points, tell(points)) if len(points) else self
         if len(found.refused) and not len(found.taken):
             raise found.refusal()
-        return found
+        return found._sharpened(tell, pairs, halvings) if len(found.refused) else found
 
-    def _sharpened(self, causes_at: Callable[[np.ndarray], list[str]], pairs: int, halvings: int,
+    def _sharpened(self, tell: Callable[[np.ndarray], list[str | None]], pairs: int, halvings: int,
                    ) -> Self:
-        """Return the goal with poses near its border: between invalid ones and the nearest valid
-        ones; ``causes_at`` gives why each of some poses [n, 3] is not valid."""
-        if not len(self.taken) or not len(self.refused):
-            return self
+        """Return the goal with poses near its border, between invalid ones and the nearest valid
+        ones, as ``tell`` has it of poses [n, 3]."""
         chosen = _far_apart(self.refused, pairs)
         wrong, causes = self.refused[chosen], [self.causes[k] for k in chosen]
         distance = np.linalg.norm(wrong[:, None] - self.taken[None], axis=2)
         right = self.taken[distance.argmin(axis=1)]
         for _ in range(halvings):
             middle = 0.5 * (wrong + right)
-            found = causes_at(middle)
-            does = np.array([not cause for cause in found])[:, None]
+            found = tell(middle)
+            does = np.array([cause == "" for cause in found])[:, None]
             wrong, right = np.where(does, wrong, middle), np.where(does, middle, right)
             causes = [new or old for new, old in zip(found, causes, strict=True)]
-        return replace(self, taken=np.concatenate([self.taken, right]),
-                       refused=np.concatenate([self.refused, wrong]),
-                       causes=(*self.causes, *causes))
+        return self._told(np.concatenate([right, wrong]), [""] * len(right) + causes)
 
-    def _of_states(self, field: EnergyField) -> Self:
-        """Test states of the branch model at samples of the field in the region, far apart, and
-        between them."""
-        inside = field.samples.positions[
-            self.region.distance(self.point.in_states(field.samples)) <= 0.0]
-        if not len(inside):
-            return self
-
-        def causes_at(middle: np.ndarray) -> list[str]:
-            causes = ["the branch has no equilibrium there"] * len(middle)
-            for one in solve_branch(self.grasp_model, middle, workers=1)[0]:
-                causes[one.target] = self._cause(self.point.in_states(one.state)[0],
-                                                 one.state.displacements[0])
-            return causes
-        return self._solved(inside[_far_apart(inside, _SOLVED)])._sharpened(
-            causes_at, _SOLVED_PAIRS, _SOLVED_HALVINGS)
-
-    def _solved(self, grasps: np.ndarray) -> Self:
-        """Return the goal with what the branch model comes to at ``grasps`` [n, 3]."""
-        found = [one.state for one in solve_branch(self.grasp_model, grasps, workers=1)[0]]
-        return self._met(States.joined(*found)) if found else self
-
-    def _met(self, states: States) -> Self:
-        return self._asked(states.positions, self.point.in_states(states), states.displacements)
-
-    def _asked(self, grasps: np.ndarray, positions: np.ndarray, moved: np.ndarray | None) -> Self:
-        """Return the goal with poses [n, 3] added that have the target at ``positions`` [n, 3]; the
-        nodes are displaced by ``moved`` [n, nodes, 3] there."""
-        inside = np.flatnonzero(self.region.distance(positions) <= 0.0)
-        causes = [self._cause(positions[k], None if moved is None else moved[k]) for k in inside]
-        does = np.array([not cause for cause in causes], bool)
-        return replace(self, taken=np.concatenate([self.taken, grasps[inside[does]]]),
-                       refused=np.concatenate([self.refused, grasps[inside[~does]]]),
+    def _told(self, grasps: np.ndarray, causes: Sequence[str | None]) -> Self:
+        """Return the goal with poses [n, 3] added, and why each is not valid: empty if it is, None
+        if the branch does not come into the region there, which tells nothing."""
+        does = np.array([cause == "" for cause in causes], bool)
+        not_so = np.array([bool(cause) for cause in causes], bool)
+        return replace(self, taken=np.concatenate([self.taken, grasps[does]]),
+                       refused=np.concatenate([self.refused, grasps[not_so]]),
                        causes=(*self.causes, *filter(None, causes)))
 
-    def _cause(self, position: np.ndarray, moved: np.ndarray | None) -> str:
-        """Return why a position is not valid, with the nodes displaced by ``moved`` [n, 3]; empty
-        if it is."""
+    def _by_model(self, grasps: np.ndarray) -> list[str | None]:
+        """Return what :meth:`_causes` says of the branch model at ``grasps`` [n, 3]; None where it
+        has no equilibrium."""
+        causes: list[str | None] = [None] * len(grasps)
+        for one in solve_branch(self.grasp_model, grasps, workers=1)[0]:
+            causes[one.target] = self._causes(one.state)[0]
+        return causes
+
+    def _causes(self, states: States) -> list[str | None]:
+        """Return why each state is not valid; see :meth:`_told`."""
+        return [self._cause(*one) for one in zip(self.point.in_states(states),
+                                                 states.displacements, strict=True)]
+
+    def _cause(self, position: np.ndarray, moved: np.ndarray | None) -> str | None:
         if self.region.distance(position[None])[0] > 0.0:
-            return "it lies outside"
+            return None
         surface = None
         if self.cell_place.of_surface and moved is not None:
             surface = self._surface(moved)
