@@ -12,7 +12,7 @@ from limber.core.progress import Progress
 from limber.estimation.estimated_branch import require_scale_in_principle
 from limber.estimation.fitting.objective import EvaluationLog, Objective, Stopped
 from limber.estimation.fitting.optimise import best_so_far, gauss_newton, nelder_mead
-from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
+from limber.estimation.parameters import LINK_DEVIATION
 from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.identifiability import (
@@ -57,7 +57,7 @@ def test_sensitivities_equal_central_differences(small_bench, small_pull):
         entry = small_pull.entry.model_copy(update={"drive": drive})
         settings = SETTINGS.model_copy(update={"also": ("poisson",), "key_frames": 3})
         objective = small_bench.objective([replace(small_pull, entry=entry)], settings)
-        free = np.r_[np.log(0.8 * TRUTH), 0.33]
+        free = np.r_[np.log(0.8 * TRUTH), 1.36]
         exact = objective.evaluate(free, jacobian=True).jacobian
         off = np.linalg.norm(residual_slopes(objective, free, 2e-4) - exact, axis=0)
         assert np.all(off < 2e-3 * np.linalg.norm(exact, axis=0))
@@ -240,12 +240,6 @@ def test_three_pulls_know_more_than_one(small_bench, small_pull):
     one, three = intervals(names[:1]), intervals(names)
     ratio = np.log(one[:, 1] / one[:, 0]) / np.log(three[:, 1] / three[:, 0])
     assert np.all((1.3 < ratio) & (ratio < 2.3))
-
-
-def test_free_values_that_are_not_free(small_bench):
-    """Fixed values stay fixed: Poisson's ratio is what was given."""
-    space = ParameterSpace.separate(Values(TRUTH, 0.31, 900.0))
-    assert space.unpack(np.log(TRUTH)).poisson == 0.31
 
 
 @pytest.mark.slow

@@ -244,9 +244,8 @@ def test_the_guides_beam_has_the_moduli_that_others_found(tmp_path, monkeypatch,
     moved = np.linalg.norm(told["import-pull"]["displacement_m"][:3], axis=1)
     assert moved == pytest.approx(0.0173, abs=8e-4)
     (low, high), = told["estimate"]["young_interval_pa"]
-    # fTetWild draws another mesh in each run. With one of five Poisson's ratio ended at its bound,
-    # with E 2 % lower and an interval of 1.31; else of 1.2.
-    assert low < 264e3 < high and high > 0.99 * 283e3 and high / low < 1.35
+    # fTetWild draws another mesh in each run, with which E varies by 0.4 %.
+    assert low < 264e3 < high and high > 0.99 * 283e3 and high / low < 1.25
     assert told["estimate"]["young_pa"] == pytest.approx([264.5e3], rel=0.03)
     # The same by bricks, the load on the whole edge: 26.0 mm at 264 kPa.
     assert np.mean(told["predict"]["drops_m"][:3]) == pytest.approx(0.026, rel=0.03)

@@ -86,6 +86,7 @@ class RoughObjective:
         self.space = ParameterSpace.separate(Values(np.array([1e9, 1e9]), 0.35, 900.0))
         self.slopes = rng.standard_normal((300, 2)) * [1.0, 0.4]
         self.noise = rng.standard_normal(300)
+        self.variance = 1.0
         self.ripple = roughness * rng.standard_normal(300)
         self.count = 0
 

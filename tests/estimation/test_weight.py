@@ -92,7 +92,7 @@ def test_a_branch_too_soft_for_its_weight_is_estimated_without(scanned, softer, 
     found = fit_branch([pull], start, FitSpec(**SETTINGS), log=EvaluationLog(None, ""),
                        progress=Progress(on_warning=messages.append))
     assert found.is_weightless != stands
-    told = "density of 5.*5 standard deviations" if stands else "too soft to carry"
+    told = "density of 6.*4 standard deviations" if stands else "too soft to carry"
     assert any(re.search(told, text) for text in messages)
     if not stands:
         np.testing.assert_allclose(found.values.young, soft, rtol=0.02 + 0.14 * noise)

@@ -7,6 +7,7 @@ from tests.subjects.meshes import box_mesh
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.materials.materials import log_bulk_over_shear, poisson_of
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics.rest_shape import unloaded_rest_shape
@@ -114,12 +115,13 @@ def test_sensitivities(mesh):
     model = prestress(mesh, SIDEWAYS)
     pose = pulled(grasp, 0.10, 0.06, -0.04)
     at = solve_static(model, grasp=grasp, pose=pose).require()
-    found = static_sensitivities(model, at, grasp, None, ("log_young", "poisson", "log_density"))
+    found = static_sensitivities(model, at, grasp, None, (
+        "log_young", "log_bulk_over_shear", "log_density"))
     changes = ({"young": 1e8}, {"poisson": 0.35}, {"density": 900.0})
     for column, change in enumerate(changes):
         (name, value), = change.items()
-        shifts = (step, -step) if name == "poisson" else (np.exp(step), np.exp(-step))
-        moved = [value + s if name == "poisson" else value * s for s in shifts]
+        moved = [poisson_of(log_bulk_over_shear(value) + s) if name == "poisson"
+                 else value * np.exp(s) for s in (step, -step)]
         ahead, behind = (solve_static(model.with_parameters(**{name: v}), grasp=grasp, pose=pose,
                                       start=at).require() for v in moved)
         slope = (ahead.displacement - behind.displacement) / (2 * step)

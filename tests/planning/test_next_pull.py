@@ -109,7 +109,7 @@ def test_a_new_pull_has_as_many_frames_as_the_last(small_pull):
 
 def test_an_estimate_without_finite_intervals_is_as_none():
     """Else: covariance of moduli and form as it has them, what pulls cannot narrow apart."""
-    found = {"groups": [0, 0], "parameters": ["E1=E2", "poisson", "form"],
+    found = {"groups": [0, 0], "parameters": ["E1=E2", "bulk over shear", "form"],
              "covariance": np.diag([0.04, 0.01, 0.25]).tolist(),
              "young_pa": [1e9, 1e9], "young_interval_sensor_pa": None,
              "young_interval_pa": (1e9 * np.exp(np.outer([1, 1], [-0.392, 0.392]))).tolist()}

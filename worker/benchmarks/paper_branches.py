@@ -11,7 +11,7 @@ from limber.estimation.fit import fit_pulls
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.solved_pull import QuasiStaticForward
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import BULK, ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import PullSpec, TrueBranch, simulate_pull
 from limber.geometry.reconstruction import mesh_skeleton
@@ -170,7 +170,7 @@ class Bench:
         for forward in forwards:
             forward.skeleton = self.branch.skeleton
         poisson = 0.35 if settings.poisson is None else settings.poisson
-        extra = ("poisson",) if "poisson" in settings.also else ()
+        extra = (BULK,) if "poisson" in settings.also else ()
         start = Values(np.full(len(self.points), 1e7), poisson, 900.0)
         return Objective(forwards, ParameterSpace.separate(start, extra),
                          force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])

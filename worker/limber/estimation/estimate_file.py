@@ -95,7 +95,7 @@ class _Estimate(_Told):
     young_interval_sensor_pa: list[tuple[_Maybe, _Maybe]] | None = None
     bending_stiffness_nm2: list[_Positive] | None = None
     bending_stiffness_interval_nm2: list[tuple[_Maybe, _Maybe]] | None = None
-    bending_stiffness_share: list[list[_Share]] | None = None
+    bending_stiffness_share: list[list[float]] | None = None
     young_deviation: dict[str, list[_Maybe] | bool | None] = {}
     poisson: float = Field(gt=-1, lt=0.5)
     density: _Positive | None = None

@@ -22,7 +22,14 @@ from limber.estimation.forward.forward_model import (
 )
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.solved_pull import QuasiStaticForward, uses_torque
-from limber.estimation.parameters import ParameterSpace, Values, YoungField, open_field
+from limber.estimation.parameters import (
+    BULK,
+    ParameterSpace,
+    Values,
+    YoungField,
+    bulk_prior,
+    open_field,
+)
 from limber.estimation.settings import FitSpec
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton, control_points
@@ -160,14 +167,13 @@ def _reached(mesh: TetMesh, skeleton: Skeleton, points: np.ndarray,
     at = fork[high]
     beyond = along - skeleton.arc_length[at] - skeleton.radius[at]
     kept = stays[high] | (beyond < FOOT * skeleton.radius[high])
-    # What the base is not joined to would move freely.
-    corners = mesh.tets[kept][:, :4]
-    links = sparse.csr_matrix((np.ones(3 * len(corners)), (np.repeat(corners[:, 0], 3),
-                                                           corners[:, 1:].ravel())),
-                              (mesh.node_count, mesh.node_count))
-    _, piece = connected_components(links, directed=False)
-    base = piece[np.flatnonzero(mesh.point_data["fixed"])[0]]
-    kept &= piece[mesh.tets[:, 0]] == base
+    # What no chain of faces joins to the base would move freely, or turn about an edge.
+    faces = np.sort(mesh.tets[kept][:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]], axis=2)
+    number = np.unique(faces.reshape(-1, 3), axis=0, return_inverse=True)[1].ravel()
+    links = sparse.csr_matrix((np.ones(len(number)), (np.arange(len(number)) // 4, number)))
+    _, piece = connected_components(links @ links.T, directed=False)
+    on_base = mesh.point_data["fixed"].astype(bool)[faces].all(axis=2).any(axis=1)
+    kept[kept] = np.isin(piece, piece[on_base])
     return kept, np.where(kept, -1, at)
 
 
@@ -375,7 +381,7 @@ def parameter_space(subject: Subject, forwards: list[Forward], settings: FitSpec
     """Return the free parameters: Poisson's ratio, density if weight or inertia acts, and the
     field's form within their priors; requested ones (``--also``) without a prior."""
     fitted = {name: part in settings.also for name, part in (
-        ("poisson", "poisson"), ("density", "density"), ("alpha", "damping"),
+        (BULK, "poisson"), ("density", "density"), ("alpha", "damping"),
         ("beta", "damping"))}
     chosen = {name for name, is_fitted in fitted.items() if is_fitted}
     form = subject.field.names if subject.field is not None else ()
@@ -383,8 +389,8 @@ def parameter_space(subject: Subject, forwards: list[Forward], settings: FitSpec
     if settings.method == "gauss-newton":
         weighs = any(forward.is_dynamic or under_its_weight(
             subject.model, forward.entry).gravity.any() for forward in forwards)
-        if settings.poisson_sigma > 0 and "poisson" not in chosen:
-            priors.append(("poisson", subject.start.poisson, settings.poisson_sigma))
+        if settings.poisson_sigma > 0 and BULK not in chosen:
+            priors.append((BULK, *bulk_prior(subject.start.poisson, settings.poisson_sigma)))
         if settings.density_sigma > 0 and "density" not in chosen and weighs:
             priors.append(("density", float(np.log(subject.start.density)),
                            settings.density_sigma))

@@ -27,21 +27,7 @@ from limber.estimation.fit_assessment import (
     judge_fit,
     require_one_explanation,
 )
-from limber.estimation.fitting.initial_modulus import (
-    EXPLAINED,
-    ROUNDS,
-    SMALL_RAD,
-    beam_start,
-    beams_of,
-    far_from_stated,
-    far_points,
-    fitted_frame,
-    put_right,
-    scaled_start,
-    standing,
-    standing_start,
-    unexplained,
-)
+from limber.estimation.fitting import initial_modulus as starts
 from limber.estimation.fitting.nuisances import NAMED
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective, Stopped
 from limber.estimation.fitting.optimise import (
@@ -57,21 +43,9 @@ from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, Values, bump_deviations, hats, stations_of
 from limber.estimation.settings import FitSpec
-from limber.estimation.uncertainty.covariance import (
-    averaged,
-    profiled,
-    repeated,
-    scaled_rows,
-    uncertainty,
-)
+from limber.estimation.uncertainty import covariance
+from limber.estimation.uncertainty import identifiability as identify
 from limber.estimation.uncertainty.creep import with_creep
-from limber.estimation.uncertainty.identifiability import (
-    SCALE_DEVIATION,
-    force_is_measured,
-    identifiability,
-    link_unresolved,
-    require_scale,
-)
 from limber.geometry.skeleton.skeleton import FRACTIONS
 from limber.recordings.recording import Pull, calibration_of
 from limber.recordings.sensor_checks import force_unit_suspicion
@@ -157,7 +131,7 @@ class _Strategy:
         found = replace(self, subject=self.subject.without_weight())._driven(
             EvaluationLog(None, ""))
         found.is_weightless = not self.subject.carries_itself(found.values)
-        if found.is_weightless and found.scale_deviation <= SCALE_DEVIATION:
+        if found.is_weightless and found.scale_deviation <= identify.SCALE_DEVIATION:
             # Otherwise nothing is known of how soft it is, and the estimate is refused.
             self.progress.warn(
                 "The branch is too soft to carry its own weight in the scanned shape. The estimate "
@@ -182,12 +156,13 @@ class _Strategy:
         if "frame" not in self.settings.also:
             return self._placed(log)
         step, found = self, self._placed(log)
-        for _ in range(ROUNDS - 1):
-            shift, turn = fitted_frame(found.cell_errors)
-            if found.stopped or np.linalg.norm(turn) < SMALL_RAD:
+        for _ in range(starts.ROUNDS - 1):
+            shift, turn = starts.fitted_frame(found.cell_errors)
+            if found.stopped or np.linalg.norm(turn) < starts.SMALL_RAD:
                 break
             middle = found.objective.forwards[0].rest_points.mean(axis=0)
-            step = replace(step, pulls=[put_right(one, shift, turn, middle) for one in step.pulls])
+            step = replace(step, pulls=[
+                starts.put_right(one, shift, turn, middle) for one in step.pulls])
             found = step._placed(EvaluationLog(None, ""))
         try:
             other = self._with(also=tuple(part for part in self.settings.also if part != "frame")
@@ -202,17 +177,17 @@ class _Strategy:
         are stated: an error along a bent branch is not linear."""
         forwards = forwards_of(self.pulls, self.subject, self.settings)
         start, near, shifts, known = None, self.near, {}, self.known
-        beams = [] if any(forward.is_dynamic for forward in forwards) else beams_of(forwards)
+        beams = [] if any(forward.is_dynamic for forward in forwards) else starts.beams_of(forwards)
         if beams:
-            begun = beam_start(beams, self.subject.start)
+            begun = starts.beam_start(beams, self.subject.start)
             start = begun.values
-            if begun.explained < EXPLAINED:
-                self.progress.warn(unexplained(begun))
-            shifts = far_from_stated(beams, begun)
+            if begun.explained < starts.EXPLAINED:
+                self.progress.warn(starts.unexplained(begun))
+            shifts = starts.far_from_stated(beams, begun)
         if known:
             shifts = {forward.name: np.asarray(forward.point_shifts) for forward in known
                       if np.any(forward.point_shifts)}
-        for rounds_left in reversed(range(ROUNDS)):
+        for rounds_left in reversed(range(starts.ROUNDS)):
             if shifts:
                 forwards = forwards_of(self.pulls, self.subject, self.settings, shifts)
             for forward in forwards if beams else ():
@@ -226,7 +201,7 @@ class _Strategy:
                 expected_count=20 if self.settings.method == "gauss-newton" else 200)
             found = fit_pulls(objective, self.subject.start, self.settings, self.progress,
                               near=near, scaled=start, quick=True)
-            far = far_points(found.cell_errors, shifts)
+            far = starts.far_points(found.cell_errors, shifts)
             if far is None or found.stopped or not rounds_left:
                 return found
             shifts, near, log, known = far, found.values, EvaluationLog(None, ""), forwards
@@ -258,11 +233,11 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
     if first is None:
         near, first = _standing(objective, start, scaled, progress)
     start = present(near, "initial values")
-    judged = identifiability(first, objective.space)
-    if not force_is_measured(objective):
-        require_scale(judged, objective, first)
+    judged = identify.identifiability(first, objective.space)
+    if not identify.force_is_measured(objective):
+        identify.require_scale(judged, objective, first)
     # Whether to warn is decided at the end: the data determine a modulus better once it is soft.
-    space, _ = link_unresolved(first, objective.space)
+    space, _ = identify.link_unresolved(first, objective.space)
     if space.links:
         objective = objective.with_space(space)
     try:
@@ -273,12 +248,13 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
         fit, objective = with_creep(fit, objective)
+        fit = covariance.weighed(fit, objective)
         _require_stable(objective, objective.space.unpack(fit.evaluation.free))
-        fit = averaged(fit, objective)
+        fit = covariance.averaged(fit, objective)
     elif not stopped:
-        for message in link_unresolved(fit.evaluation, objective.space)[1]:
+        for message in identify.link_unresolved(fit.evaluation, objective.space)[1]:
             progress.warn(message)
-    found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged)
+    found = Estimate(fit, objective, covariance.uncertainty(fit.evaluation, objective), judged)
     if not quick:
         complete(found, settings, progress)
     return found
@@ -289,8 +265,8 @@ def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) ->
     without a valid result has no intervals."""
     is_sound = not found.stopped and found.is_bad is None
     if is_sound:
-        found.uncertainty = profiled(found.uncertainty, found.fit.evaluation, found.objective,
-                                     progress)
+        found.uncertainty = covariance.profiled(
+            found.uncertainty, found.fit.evaluation, found.objective, progress)
     judge_fit(found, progress)
     if settings.hold_out and len(found.objective.forwards) > 1 and is_sound:
         hold_out(found, progress)
@@ -299,12 +275,13 @@ def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) ->
 def _standing(objective: Objective, start: Values, scaled: Values | None, progress: Progress,
               ) -> tuple[Values, Evaluation]:
     """Return initial values that have equilibria, and their evaluation."""
-    start = scaled_start(objective, start) if scaled is None else standing(objective, scaled)
+    start = starts.scaled_start(objective, start) if scaled is None else starts.standing(
+        objective, scaled)
     if any(forward.uses_force for forward in objective.forwards):
         suspicion = force_unit_suspicion(float(np.exp(np.mean(np.log(start.young)))))
         if suspicion:
             progress.warn(suspicion)
-    found = standing_start(objective, start)
+    found = starts.standing_start(objective, start)
     if found is None:
         raise _without_equilibrium(objective)
     _require_stable(objective, found[0])
@@ -394,7 +371,7 @@ def _linked_at_the_end(fit: Fit, objective: Objective, settings: FitSpec,
     the first round links are only added; otherwise the iteration might not end."""
     messages: list[str] = []
     for attempt in range(objective.space.group_count):
-        space, messages = link_unresolved(fit.evaluation, objective.space)
+        space, messages = identify.link_unresolved(fit.evaluation, objective.space)
         if attempt:
             kept = objective.space.links
             space = space.linked(kept + tuple(link for link in space.links if link[0] not in {
@@ -481,9 +458,9 @@ class _Problem:
     def of(cls, found: Estimate) -> "_Problem":
         evaluation, space = found.fit.evaluation, found.objective.space
         field = found.objective.forwards[0].field
-        noise = evaluation.mean_square * repeated(found.objective.standardised(evaluation))
-        residual, slopes = (scaled_rows(rows, space.own_row_count, noise) for rows in (
-            evaluation.residual[:, None], evaluation.slopes))
+        residual, slopes = (
+            covariance.scaled_rows(rows, space.own_row_count, found.objective.variance)
+            for rows in (evaluation.residual[:, None], evaluation.slopes))
         stations = stations_of(FRACTIONS)
         bumps = [number for number, place in enumerate(stations)
                  if not np.isclose(place, FRACTIONS).any()]

@@ -11,21 +11,16 @@ from limber.core.errors import Command, Option, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of, neck
+from limber.estimation.fitting import nuisances
 from limber.estimation.fitting.initial_modulus import held_out, without
-from limber.estimation.fitting.nuisances import (
-    CREEP,
-    NAMED,
-    OTHER_CAUSES,
-    in_words,
-    nuisance_records,
-    unlikely,
-)
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import AT_REST_M
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import Values, pieces_along
 from limber.estimation.settings import FitSpec
+from limber.estimation.uncertainty import model_error as errors
+from limber.estimation.uncertainty import shape_error as shapes
 from limber.estimation.uncertainty.covariance import Uncertainty, largest, outliers, variance_parts
 from limber.estimation.uncertainty.creep import creep_sentence
 from limber.estimation.uncertainty.identifiability import (
@@ -34,23 +29,8 @@ from limber.estimation.uncertainty.identifiability import (
     identifiability,
     too_little_said,
 )
-from limber.estimation.uncertainty.model_error import (
-    ModelError,
-    geometry_error,
-    mesh_error,
-    observer,
-    path_error,
-    path_prescribed,
-    steady_loads,
-)
+from limber.estimation.uncertainty.model_error import ModelError
 from limber.estimation.uncertainty.next_actions import Prospects
-from limber.estimation.uncertainty.shape_error import (
-    SectionMean,
-    grip_error,
-    hung_error,
-    shape_error,
-    strain_energy,
-)
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.materials.materials import LayeredSection
 from limber.recordings.recording import GraspEntry, Pull, calibration_of, grasp_on
@@ -108,7 +88,7 @@ class Estimate:
     held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
     model_error: ModelError = field(default_factory=ModelError)
     second_moment: np.ndarray | None = None
-    sections: SectionMean | None = None
+    sections: shapes.SectionMean | None = None
     is_weightless: bool = False
 
     @property
@@ -138,17 +118,16 @@ class Estimate:
     @property
     def cell_errors(self) -> list[dict[str, Any]]:
         """Each error of cell and sensors with its value and interval."""
-        errors = self.fit.evaluation.errors
-        return [] if errors is None else nuisance_records(self.objective.cell_errors.nuisances,
-                                                          errors,
-                                                          self.uncertainty.covariance)
+        found = self.fit.evaluation.errors
+        return [] if found is None else nuisances.nuisance_records(
+            self.objective.cell_errors.nuisances, found, self.uncertainty.covariance)
 
     @property
     def creep(self) -> dict[str, Any] | None:
         """Creep of the branch: ``share`` by which a lasting load lowers the moduli, its 95 %
         ``interval``, and ``time_s``, the time constant [s]; None: the record does not show it.
         """
-        record = next((each for each in self.cell_errors if each["name"] == CREEP), None)
+        record = next((each for each in self.cell_errors if each["name"] == nuisances.CREEP), None)
         if record is None:
             return None
         seconds = next(each.creep_time for each in self.objective.forwards if each.creep_time)
@@ -161,7 +140,7 @@ class Estimate:
         parts = variance_parts(self.fit.evaluation, self.objective,
                                sure.variance_factor * sure.repetition)
         for name, deviation in self.model_error.parts.items():
-            cause = OTHER_CAUSES[name].name
+            cause = nuisances.OTHER_CAUSES[name].name
             parts[cause] = parts.get(cause, 0.0) + deviation**2
         return parts
 
@@ -197,7 +176,7 @@ class Estimate:
         if beyond:
             return (f"{', '.join(beyond)}. No plant has such a modulus: they are between {low:.0e} "
                     f"and {high:.0e} Pa.")
-        if error := unlikely(self.cell_errors):
+        if error := nuisances.unlikely(self.cell_errors):
             return error
         scale = self.scale_deviation
         if not scale <= SCALE_DEVIATION:
@@ -239,11 +218,11 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
             "intervals are widened by this factor.")
     if found.stopped or found.is_bad is None:
         # Of a refused fit neither is known, and no interval includes them.
-        if (corrected := in_words(found.cell_errors)) is not None:
+        if (corrected := nuisances.in_words(found.cell_errors)) is not None:
             progress.warn(corrected)
         if (creep := found.creep) is not None:
             progress.warn(creep_sentence(creep))
-    if abs(found.density_off) > NAMED:
+    if abs(found.density_off) > nuisances.NAMED:
         progress.warn(
             f"The pulls fit with a density of {found.values.density:.3g} kg/m3. That is "
             f"{abs(found.density_off):.0f} standard deviations from the stated one. Weigh a piece "
@@ -302,8 +281,7 @@ def require_result(found: Estimate, skeleton: Skeleton) -> None:
     if not found.scale_deviation <= SCALE_DEVIATION and any(
             forward.uses_force for forward in found.objective.forwards):
         raise too_little_said(found.objective, found.fit.evaluation, SCALE_DEVIATION)
-    young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
-    ended = f"The fit ended at {young} MPa. Nothing was written."
+    ended = f"The fit ended at {_listed(found.values.young)} MPa. Nothing was written."
     reason = " ".join([reason, *_force_off(found)])
     seen = [*_points_off(found.objective.forwards), *neck(skeleton)]
     if seen:
@@ -378,8 +356,10 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
     """Compute errors of shape and mesh, which residuals do not show, from the table of fitted
     cylinders and the scan's points [n, 3] [m], where they exist."""
     subject = subject.without_weight() if found.is_weightless else subject
-    found.sections = SectionMean.of(subject.skeleton, subject.mesh, subject.weights,
-                                    strain_energy(found.objective, found.values))
+    pieces = pieces_along(subject.mesh, subject.skeleton, shapes.PIECES)
+    effect = shapes.effect_of_pieces(found.fit.evaluation, found.objective, pieces)
+    found.sections = shapes.SectionMean.of(
+        subject.skeleton, subject.mesh, subject.weights if effect is None else pieces, effect)
     found.second_moment = np.exp(found.sections.log_second_moment(
         subject.skeleton.radius, LayeredSection(**settings.section)))
     error = _geometry_error(subject, found, settings, axes, cloud, progress)
@@ -389,15 +369,15 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         model = subject.model.with_parameters(poisson=found.values.poisson,
                                               density=found.values.density)
         forwards = found.objective.forwards
-        seen = observer(subject.mesh, forwards, held, subject.control_points)
-        stiff = mesh_error(model, held, seen, subject.weights, found.values.young,
-                           steady_loads(forwards))
+        seen = errors.observer(subject.mesh, forwards, held, subject.control_points)
+        stiff = errors.mesh_error(model, held, seen, subject.weights, found.values.young,
+                                  errors.steady_loads(forwards))
         if stiff is not None:
             error = replace(error.having(mesh=stiff.deviation), mesh_factor=stiff.factor)
     found.model_error = error.having(
         path=_path_error(found, progress),
-        hung=hung_error(found.fit.evaluation, found.objective, settings.hung_sigma),
-        grip=grip_error(found.fit.evaluation, found.objective))
+        hung=shapes.hung_error(found.fit.evaluation, found.objective, settings.hung_sigma),
+        grip=shapes.grip_error(found.fit.evaluation, found.objective))
     _tell_largest_part(found.causes, progress)
     if "frame" in settings.also:
         progress.warn(
@@ -408,10 +388,10 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
 
 def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
     """Error from the gripper's frame if its path is prescribed, with a warning."""
-    prescribed = path_prescribed(found.objective.forwards)
+    prescribed = errors.path_prescribed(found.objective.forwards)
     if not prescribed:
         return None
-    error = path_error(found.fit.evaluation, found.objective)
+    error = errors.path_error(found.fit.evaluation, found.objective)
     grown = ("Its effect could not be computed and is NOT in the intervals"
              if error is None else
              f"It adds up to {100 * error.max():.0f} % to the standard deviations")
@@ -428,11 +408,12 @@ def _geometry_error(subject: Subject, found: Estimate, settings: FitSpec,
     """From the scan's axis and radii; none for a skeleton that was not fitted to a scan."""
     if axes is None:
         return ModelError()
-    radii = geometry_error(axes, subject.mesh, subject.weights)
+    radii = errors.geometry_error(axes, subject.mesh, subject.weights)
     if radii is None or cloud is None:
         return ModelError().having(geometry=radii)
-    drawn = shape_error(found.fit.evaluation, found.objective, subject, cloud, settings.shapes,
-                        present(found.sections, "sections of the branch"), progress=progress)
+    drawn = shapes.shape_error(
+        found.fit.evaluation, found.objective, subject, cloud, settings.shapes,
+        present(found.sections, "sections of the branch"), progress=progress)
     return (ModelError({"geometry": radii}) if drawn is None else
             ModelError({"geometry": drawn[0]}, bending=drawn[1], axis_is_exact=False))
 

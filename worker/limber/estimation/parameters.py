@@ -5,16 +5,34 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.spatial import cKDTree
 
 from limber.core.not_none import present
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.materials.materials import MAX_POISSON, log_bulk_over_shear, poisson_of
 
 YOUNG_BOUNDS_PA = (1e4, 1e11)
-POISSON_BOUNDS = (0.0, 0.495)
+BULK = "bulk over shear"
+"""The unknown that stands for Poisson's ratio: log 3 K / 2 G. Any number is possible, whereas the
+ratio ends at 0.5, which a nearly incompressible branch is close to.
+"""
+BULK_BOUNDS = (-2.0, log_bulk_over_shear(MAX_POISSON))
 DENSITY_BOUNDS = (50.0, 5000.0)
 FORM_BOUNDS = (-5.0, 5.0)
+
+
+def bulk_prior(poisson: float, sigma: float) -> tuple[float, float]:
+    """Return mean and deviation of ``BULK``: the median and half of the middle 68 % of a Poisson's
+    ratio that is normal within -1 and 0.5."""
+    low, high = scipy.special.ndtr((np.array([-1.0, 0.5]) - poisson) / sigma)
+    middle = scipy.special.ndtr([0.0, -1.0, 1.0])
+    mean, less, more = (log_bulk_over_shear(poisson + sigma * each) for each in scipy.special.ndtri(
+        low + (high - low) * middle))
+    return mean, (more - less) / 2
+
+
 LINK_DEVIATION = 1.2
 """Deviation of the logarithm of the ratio of two neighbouring moduli before any measurement: the
 nine ratios in the paper's table have a root mean square of 1.1.
@@ -37,13 +55,13 @@ class Values:
 class ParameterSpace:
     """The free parameters; ``base`` has the fixed ones and the free ones' initial values.
 
-    The free vector contains log E of each group, then those of the form of the field, Poisson's
-    ratio, log density, log alpha and log beta that are free.
+    The free vector contains log E of each group, then those of the form of the field, ``BULK``,
+    log density, log alpha and log beta that are free.
 
     Attributes:
         groups: Group of each control point, from 0, shape [K]; a group shares one modulus.
         extra: Names of the free ones: all that describe the form, named "form ...", or none; then
-            out of "poisson", "density", "alpha", "beta", in this order.
+            out of ``BULK``, "density", "alpha", "beta", in this order.
         links: Pairs of groups of which the data do not determine the first: it is assumed to differ
             from the second as neighbours do.
         priors: Names out of ``extra`` with mean and standard deviation of their free value.
@@ -84,7 +102,7 @@ class ParameterSpace:
         member = self.membership
         young = member.T @ np.log(values.young) / member.sum(axis=0)
         form = [name for name in self.extra if name.startswith("form")]
-        tail = {"poisson": values.poisson, "density": np.log(values.density),
+        tail = {BULK: log_bulk_over_shear(values.poisson), "density": np.log(values.density),
                 "alpha": np.log(max(values.damping[0], 1e-9)),
                 "beta": np.log(max(values.damping[1], 1e-9)),
                 **dict(zip(form, values.form or np.zeros(len(form)), strict=True))}
@@ -97,7 +115,7 @@ class ParameterSpace:
         tail = dict(zip(self.extra, free[self.group_count:], strict=True))
         alpha, beta = self.base.damping
         form = tuple(float(value) for name, value in tail.items() if name.startswith("form"))
-        return Values(young, float(tail.get("poisson", self.base.poisson)),
+        return Values(young, poisson_of(tail[BULK]) if BULK in tail else self.base.poisson,
                       float(np.exp(tail["density"])) if "density" in tail else self.base.density,
                       (float(np.exp(tail["alpha"])) if "alpha" in tail else alpha,
                        float(np.exp(tail["beta"])) if "beta" in tail else beta),
@@ -105,7 +123,7 @@ class ParameterSpace:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the free vector."""
-        tail = {"poisson": POISSON_BOUNDS, "density": np.log(DENSITY_BOUNDS),
+        tail = {BULK: BULK_BOUNDS, "density": np.log(DENSITY_BOUNDS),
                 "alpha": np.log((1e-6, 1e4)), "beta": np.log((1e-8, 1.0)),
                 **{name: FORM_BOUNDS for name in self.extra if name.startswith("form")}}
         pairs = [np.log(YOUNG_BOUNDS_PA)] * self.group_count + [tail[name] for name in self.extra]
@@ -155,7 +173,7 @@ def equal_values(one: Values | None, other: Values) -> bool:
 
 def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
     """Return the parameters by their names in :mod:`limber.mechanics.sensitivities`."""
-    names = {"poisson": "poisson", "density": "log_density", "alpha": "damping_mass",
+    names = {BULK: "log_bulk_over_shear", "density": "log_density", "alpha": "damping_mass",
              "beta": "damping_stiffness"}
     # Parameters of the field's form come with log E.
     return ("log_young", *(names[name] for name in extra if name in names))
@@ -366,6 +384,14 @@ def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, n
     side = np.concatenate([orders, *3 * [orders[child]]])
     nearest = cKDTree(np.vstack(middles)).query(mesh.centroids)[1]
     return np.clip(np.concatenate(positions)[nearest], 0.0, 1.0), side[nearest]
+
+
+def pieces_along(mesh: TetMesh, skeleton: Skeleton, count: int) -> np.ndarray:
+    """Weights of ``count`` intervals' ends along the main path, and of all that is beside it, for
+    each tetrahedron, shape [tet_count, count + 2]."""
+    along, order = _element_positions(mesh, skeleton)
+    on_path = hats(along, np.linspace(0.0, 1.0, count + 1)) * (order == 0)[:, None]
+    return np.column_stack([on_path, order > 0])
 
 
 def hats(along: np.ndarray, stations: np.ndarray) -> np.ndarray:

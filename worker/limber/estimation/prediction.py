@@ -10,7 +10,7 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.forward.solved_pull import QuasiStaticForward
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import BULK, ParameterSpace, Values
 from limber.estimation.settings import PredictSettings
 from limber.recordings.recording import PullEntry
 from limber.recordings.synchronisation import Frames
@@ -91,7 +91,7 @@ def _space(known: dict[str, Any], values: Values) -> ParameterSpace:
     """The parameters of the estimate's covariance."""
     groups = tuple(known.get("groups") or range(len(values.young)))
     extra = tuple(name for name in known.get("parameters", ())
-                  if name.startswith("form") or name in ("poisson", "density"))
+                  if name.startswith("form") or name in (BULK, "density"))
     return ParameterSpace(replace(values), groups, extra)
 
 
@@ -102,8 +102,9 @@ def _uncertain(moved: np.ndarray, slope: np.ndarray, down: np.ndarray, space: Pa
     varies as between recordings."""
     count = len(space.groups)
     free = np.concatenate([slope[..., :count] @ space.membership, slope[..., count:]], axis=-1)
-    covariance = np.array(known["covariance"])[:space.size, :space.size].copy()
     group_count = space.group_count
+    used = [*range(group_count), *(known["parameters"].index(name) for name in space.extra)]
+    covariance = np.array(known["covariance"])[np.ix_(used, used)]
     covariance[:group_count, :group_count] += float(known.get("recording_spread", 0.0))**2
     each = np.einsum("mip,pq,miq->mi", free, covariance, free)
     size = np.linalg.norm(moved, axis=1)

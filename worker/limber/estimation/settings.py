@@ -117,7 +117,7 @@ class FitSpec(EstimateSettings):
         None, gt=0, description="Initial Young's modulus [Pa] where no measured force gives "
         "one. Default: the mesh's.")
     poisson: float | None = Field(
-        None, ge=0, lt=0.495, description="Poisson's ratio, constant unless ``also`` has it. "
+        None, ge=0, lt=0.5, description="Poisson's ratio, constant unless ``also`` has it. "
         "Default: the mesh's.")
     density: float | None = Field(
         None, gt=0, description="Density [kg/m^3]. Default: the mesh's.")

@@ -14,11 +14,12 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Tangent, Viscous
-from limber.mechanics.materials.materials import lame_by_poisson
+from limber.mechanics.materials.materials import lame_by_bulk
 from limber.mechanics.model import BranchModel, MotionState, product_with
 from limber.mechanics.statics.result import StaticResult
 
-PARAMETERS = ("log_young", "poisson", "log_density", "damping_mass", "damping_stiffness")
+PARAMETERS = ("log_young", "log_bulk_over_shear", "log_density", "damping_mass",
+              "damping_stiffness")
 """Parameters for derivatives. ``log_young`` is one column for each column of the weights."""
 
 _REFINEMENTS = 12
@@ -170,8 +171,8 @@ def lame_changes(model: BranchModel, parameters: ParameterSet,
         if name == "log_young":
             changes += [(model.lame_lambda * part, model.lame_mu * part)
                         for part in young_shares(model, parameters)]
-        elif name == "poisson":
-            changes.append(lame_by_poisson(model.young * model.stiffening, model.poisson))
+        elif name == "log_bulk_over_shear":
+            changes.append(lame_by_bulk(model.young * model.stiffening, model.poisson))
         else:
             changes.append(None)
     return changes

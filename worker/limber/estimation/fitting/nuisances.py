@@ -19,6 +19,7 @@ from scipy.linalg import solve_triangular
 from limber.core.errors import Command, Option, Text
 from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward, Simulated
+from limber.estimation.parameters import BULK
 from limber.recordings.recording import CalibrationEntry, PullEntry, calibration_of
 from limber.recordings.synchronisation import Frames
 
@@ -372,7 +373,7 @@ UNKNOWNS = [
 OTHER_CAUSES = {
     "form": Cause("modulus between the control points", "add markers along the branch, or pull at "
                   "another point"),
-    "poisson": Cause("Poisson's ratio", Text("measure it, and state it (", Option("poisson"),
+    BULK: Cause("Poisson's ratio", Text("measure it, and state it (", Option("poisson"),
                                              " of reconstruct); pulls do not determine it")),
     "density": Cause("density", Text("weigh a piece of the branch (", Option("density"), ", ",
                                      Option("density_sigma"), " of reconstruct)")),

@@ -234,12 +234,6 @@ class Evaluation:
         return 0.5 * float(self.residual @ self.residual)
 
     @property
-    def mean_square(self) -> float:
-        """Mean squared residual: about 1 if the model fits and the noise is as stated."""
-        freedom = len(self.residual) - len(self.free) - self.unknown_count
-        return 2 * self.objective / max(freedom, 1)
-
-    @property
     def slopes(self) -> np.ndarray:
         """The Jacobian of an evaluation with derivatives, shape [r, p]. ValueError if the
         evaluation has no derivatives."""
@@ -275,7 +269,8 @@ class Stopped(Cancelled):
 
 
 class Objective:
-    """Evaluates free vectors, counts forward simulations and logs each one."""
+    """Evaluates free vectors, counts forward simulations and logs each one. ``variance`` is that
+    of the measurements over the stated one, by which a fit weighs them and its priors."""
 
     def __init__(self, forwards: list[Forward], space: ParameterSpace, *,
                  log: EvaluationLog | None = None, force_sigma: list[float] | None = None,
@@ -284,6 +279,7 @@ class Objective:
         self.space = space
         self.log = log or EvaluationLog(None, "")
         self.forward_count = 0
+        self.variance = 1.0
         self.force_sigma = force_sigma or [0.1] * len(forwards)
         self._progress = progress
         self._expected = expected_count
@@ -300,14 +296,16 @@ class Objective:
         other = Objective(forwards or self.forwards, space, log=self.log,
                           force_sigma=self.force_sigma, progress=self._progress,
                           expected_count=self._expected)
-        other.forward_count = self.forward_count
+        other.forward_count, other.variance = self.forward_count, self.variance
         return other
 
     def on_copies(self) -> "Objective":
         """Return an objective on copies of the pulls with its own log; evaluating it does not
         change this one."""
-        return Objective([copy.copy(forward) for forward in self.forwards], self.space,
-                         force_sigma=self.force_sigma)
+        other = Objective([copy.copy(forward) for forward in self.forwards], self.space,
+                          force_sigma=self.force_sigma)
+        other.variance = self.variance
+        return other
 
     def forget(self) -> None:
         """Evaluate again at the last parameters, because a forward model has changed."""

@@ -120,10 +120,17 @@ class _Search:
 
     def minimised(self, at: Evaluation, robust: bool, ending: float) -> Fit:
         """Descend from an evaluation to a relative change of cost."""
+        def cost(found: Evaluation) -> float:
+            squares = found.residual**2
+            if robust:
+                squares = 2 * OUTLYING**2 * (np.sqrt(1 + squares / OUTLYING**2) - 1)
+            return 0.5 * float(squares @ self._own_weights(found)**2)
+
         damping = 0.0
         for _ in range(self._limit):
-            weight = (1 + (at.residual / OUTLYING)**2)**-0.25 if robust else np.ones(
-                len(at.residual))
+            weight = self._own_weights(at)
+            if robust:
+                weight = weight * (1 + (at.residual / OUTLYING)**2)**-0.25
             slopes, residual = weight[:, None] * at.slopes, weight * at.residual
             step = self._step(at.free, slopes, residual, damping)
             length = float(np.linalg.norm(slopes @ step))
@@ -133,23 +140,29 @@ class _Search:
             longest = float(np.abs(step[:self._objective.space.group_count]).max())
             step *= min(1.0, LONGEST_STEP / max(longest, 1e-12))
             tried = self._objective.evaluate(at.free + step, jacobian=True)
-            fall = -np.inf if tried is None else _cost(at, robust) - _cost(tried, robust)
+            fall = -np.inf if tried is None else cost(at) - cost(tried)
             linear = residual + slopes @ step
             foreseen = 0.5 * float(residual @ residual - linear @ linear)
             if tried is None or fall <= 0:
                 # Too little was to be gained.
                 if damping > MOST_DAMPING or (tried is not None and foreseen < max(
-                        ending * _cost(at, robust), UNSETTLED_FALL)):
+                        ending * cost(at), UNSETTLED_FALL)):
                     return Fit(at, FitStatus.converged, "No step descends.")
                 damping = max(FIRST_DAMPING, 8 * damping)
                 continue
             damping = 0.0 if damping < FIRST_DAMPING else (
                 damping / 8 if fall > 0.25 * foreseen else 2 * damping)
-            was, at = _cost(at, robust), tried
+            was, at = cost(at), tried
             if fall < ending * was:
                 return Fit(at, FitStatus.converged, f"The last step changed the cost by less than "
                            f"{ending:g} of it.")
         return Fit(at, FitStatus.out_of_evaluations, f"{self._limit} simulations were not enough.")
+
+    def _own_weights(self, found: Evaluation) -> np.ndarray:
+        """Weights of the rows: the noisier the measurements, the more the priors count, [r]."""
+        weights, count = np.ones(len(found.residual)), self._objective.space.own_row_count
+        weights[len(weights) - count:] = self._objective.variance**0.5
+        return weights
 
     def _step(self, free: np.ndarray, slopes: np.ndarray, residual: np.ndarray, damping: float,
               ) -> np.ndarray:
@@ -168,12 +181,6 @@ class _Search:
                 break
             step[out], moves[out] = inside[out], False
         return step
-
-
-def _cost(found: Evaluation, robust: bool) -> float:
-    if not robust:
-        return found.objective
-    return float(OUTLYING**2 * np.sum(np.sqrt(1 + (found.residual / OUTLYING)**2) - 1))
 
 
 def nelder_mead(objective: Objective, start: np.ndarray, *,
@@ -239,7 +246,7 @@ def _first_steps(objective: Objective) -> np.ndarray:
     space = objective.space
     held = {name for name, _, _ in space.priors}
     return np.r_[np.full(space.group_count, FIRST_SIMPLEX), [
-        0.0 if name in held else 0.03 if name == "poisson" else 0.3 for name in space.extra]]
+        0.0 if name in held else 0.3 for name in space.extra]]
 
 
 class _Settling:

@@ -9,7 +9,7 @@ from typing_extensions import TypedDict
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.nuisances import OTHER_CAUSES, advice_on
 from limber.estimation.fitting.objective import Evaluation, Objective, inverse_information
-from limber.estimation.fitting.optimise import OUTLYING, Fit
+from limber.estimation.fitting.optimise import OUTLYING, WANDERING_STEP, Fit, gauss_newton
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, YoungField
 from limber.estimation.uncertainty.drift import scale_steps
 from limber.recordings.recording import calibration_of
@@ -39,24 +39,8 @@ class Uncertainty:
 
 def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
     """Return Gauss' approximation at a fit's end, without the mesh's error (:mod:`.model_error`).
-    Noise is scaled by a robust part of the residuals, weighted as in the fit. Errors that persist
-    over frames do not average out: their number multiplies the covariance."""
-    # Priors and links are not measurements: they do not determine the noise, and its scale does not
-    # apply to them.
-    count = len(evaluation.residual) - objective.space.own_row_count
-    jacobian, residual = evaluation.slopes[:count], evaluation.residual[:count]
-    freedom = max(len(residual) - jacobian.shape[1] - evaluation.unknown_count, 1)
-    # Huber's proposal: residuals beyond 3 deviations count as 3. If there are many, they are not
-    # outliers, but the model does not fit.
-    limit = 3 * _scale(residual)
-    stray = float(np.mean(np.abs(residual) > 1.5 * limit))
-    clipped = np.clip(residual, -limit, limit) if stray < OUTLIER_SHARE else residual
-    factor = float(clipped @ clipped / freedom)
-    if _from_images(objective):
-        # Their stated error persists from frame to frame: a smaller scatter of the residuals does
-        # not show that it is smaller.
-        factor = max(factor, 1.0)
-    repetition = repeated(objective.standardised(evaluation))
+    """
+    factor, repetition, freedom = noise_of(evaluation, objective)
     covariance = inverse_information(scaled_rows(evaluation.slopes, objective.space.own_row_count,
                                                  factor * repetition))
     from_recording = recording_spread(evaluation, objective, factor * repetition)
@@ -76,6 +60,36 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     return Uncertainty(covariance, interval, factor,
                        covariance / np.maximum(np.outer(deviation, deviation), 1e-300), repetition,
                        from_recording, quantile)
+
+
+def noise_of(evaluation: Evaluation, objective: Objective) -> tuple[float, float, int]:
+    """Return the noise's variance over the stated one, by a robust part of the residuals, weighted
+    as in the fit; the frames in a row that err alike, whose errors do not average out; and the
+    degrees of freedom."""
+    # Priors and links are not measurements: they do not determine the noise, and its scale does not
+    # apply to them.
+    residual = evaluation.residual[:len(evaluation.residual) - objective.space.own_row_count]
+    freedom = max(len(residual) - objective.space.size - evaluation.unknown_count, 1)
+    # Huber's proposal: residuals beyond 3 deviations count as 3. If there are many, they are not
+    # outliers, but the model does not fit.
+    limit = 3 * _scale(residual)
+    stray = float(np.mean(np.abs(residual) > 1.5 * limit))
+    clipped = np.clip(residual, -limit, limit) if stray < OUTLIER_SHARE else residual
+    factor = float(clipped @ clipped / freedom)
+    if _from_images(objective):
+        # Their stated error persists from frame to frame: a smaller scatter of the residuals does
+        # not show that it is smaller.
+        factor = max(factor, 1.0)
+    return factor, repeated(objective.standardised(evaluation)), freedom
+
+
+def weighed(fit: Fit, objective: Objective) -> Fit:
+    """Fit again with measurements and priors by the noise that the residuals show. A misfit that is
+    alike in all frames would else draw unknowns far beyond their priors: four frames of a hung
+    weight, Poisson's ratio."""
+    factor, repetition, _ = noise_of(fit.evaluation, objective)
+    objective.variance = factor * repetition
+    return gauss_newton(objective, fit.evaluation.free, is_near=True, shortest=WANDERING_STEP)
 
 
 def scaled_rows(rows: np.ndarray, own_row_count: int, scale: float) -> np.ndarray:
@@ -115,12 +129,12 @@ def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
         columns = np.clip(columns, -4.0, 4.0)
         known = np.isfinite(columns)
         values = np.where(known, columns, 0.0)
-        lags = len(columns) // 2
+        lags = len(columns) // 2 + 1
         product, count = (np.pad(a, (0, max(lags - len(a), 0))) for a in (product, count))
         for lag in range(lags):
             product[lag] += np.sum(values[:len(values) - lag] * values[lag:])
             count[lag] += np.sum(known[:len(known) - lag] & known[lag:])
-    if len(product) < 3 or product[0] <= 0:
+    if len(product) < 2 or product[0] <= 0:
         return 1.0
     correlation = product / product[0]
     total = 1.0
@@ -128,7 +142,7 @@ def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
         if correlation[lag] < 2.0 / np.sqrt(count[lag]) or lag > 2.5 * total:
             break
         total += 2.0 * correlation[lag]
-    return float(total)
+    return float(min(total, max(len(points) for points, _ in series)))
 
 
 class Outlier(TypedDict):
@@ -183,23 +197,25 @@ def averaged(fit: Fit, objective: Objective) -> Fit:
     field = objective.forwards[0].field
     if not field.names or not set(field.names) <= set(objective.space.extra):
         return fit
-    step = marginal_step(fit.evaluation, objective.space, field)
-    if not np.linalg.norm(fit.evaluation.slopes @ step) < LONGEST_STEP:
+    slopes = scaled_rows(fit.evaluation.slopes, objective.space.own_row_count, objective.variance)
+    step = marginal_step(fit.evaluation.free, slopes, objective.space, field)
+    if not np.linalg.norm(slopes @ step) < LONGEST_STEP:
         return fit
     lower, upper = objective.space.bounds()
     found = objective.evaluate(np.clip(fit.evaluation.free + step, lower, upper), jacobian=True)
     return fit if found is None else Fit(found, fit.status, fit.reason)
 
 
-def marginal_step(evaluation: Evaluation, space: ParameterSpace, field: YoungField) -> np.ndarray:
-    """Step [p] from the joint mode to the marginal one, of an evaluation with derivatives; the
-    field's further unknowns are free."""
+def marginal_step(free: np.ndarray, slopes: np.ndarray, space: ParameterSpace,
+                  field: YoungField) -> np.ndarray:
+    """Step [p] from the joint mode to the marginal one, by derivatives [r, p] of residuals of unit
+    variance; the field's further unknowns are free."""
     count = space.group_count
-    information = evaluation.slopes.T @ evaluation.slopes
+    information = slopes.T @ slopes
     left_open = np.diag(np.linalg.inv(information[count:, count:]))
     informed = 1 - left_open[[space.extra.index(name) for name in field.names]]
     slope = np.zeros(space.size)
-    slope[:count] = -(informed @ field.growth(space.unpack(evaluation.free))) @ space.membership
+    slope[:count] = -(informed @ field.growth(space.unpack(free))) @ space.membership
     return np.linalg.solve(information, slope)
 
 

@@ -7,6 +7,7 @@ Errors at neighbouring positions, of axis and radius, and of several moduli are 
 scan.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,7 +20,7 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.forward_model import Simulated, key_frames
 from limber.estimation.forward.solved_pull import FEW_KEYS, QuasiStaticForward
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import Values, YoungField
 from limber.estimation.uncertainty.model_error import WIDEST
 from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
@@ -209,31 +210,56 @@ def _error_of(evaluation: Evaluation, objective: Objective,
 # So the interval of E I is narrower than that of E, and predictions on the same mesh depend on E I.
 #
 # A pull does not determine E I at a position but over a length of the branch: a radius may step at
-# a fork beside a control point. I is therefore the mean over the part for which the control point
-# stands, each piece by its share of the strain energy of the pulls: where the branch is not bent,
-# nothing is determined.
+# a fork beside a control point. I is therefore a mean over the branch, each piece by what the fit
+# would have added to log E there had this piece been stiffer than its radius says. Then the error
+# of a radius cancels, wherever it is, and where the branch is not bent nothing is determined.
+
+PIECES = 12
+"""Intervals between the pieces along the main path."""
+
+
+def effect_of_pieces(evaluation: Evaluation, objective: Objective, pieces: np.ndarray,
+                     ) -> np.ndarray | None:
+    """Return the part [K, P] of a higher log stiffness of each piece of the mesh, ``pieces``
+    [tet_count, P], that the estimated log E has. None as :func:`compensation`."""
+    def slopes(forward: QuasiStaticForward, values: Values) -> Simulated:
+        aside = copy.copy(forward)
+        aside.field = _ByPieces(**vars(forward.field), pieces=pieces)
+        found = aside.simulate(values, ("piece",) * (pieces.shape[1] - len(values.young)), True)
+        return _as_shown(forward, present(found, "state at the end of the fit"))
+
+    steps = compensation(evaluation, objective, slopes)
+    return None if steps is None else -steps
+
+
+@dataclass(frozen=True)
+class _ByPieces(YoungField):
+    """A field with derivatives to log E of pieces of the mesh instead of those to its unknowns."""
+
+    pieces: np.ndarray | None = None
+
+    def shares(self, values: Values, extra: tuple[str, ...]) -> np.ndarray:
+        return present(self.pieces, "pieces of the mesh").T
 
 
 @dataclass(frozen=True)
 class SectionMean:
-    """Mean over control points' sections of the main path, by ``share`` [K, node_count] of skeleton
-    nodes."""
+    """Mean over skeleton nodes of the main path, by ``share`` [K, node_count]."""
 
     share: np.ndarray
 
     @classmethod
     def of(cls, skeleton: Skeleton, mesh: TetMesh, weights: np.ndarray,
-           energy: np.ndarray | None = None) -> "SectionMean":
-        """Prepare the mean, weighted by strain energy [tet_count] [J]; None: by length, as where
-        there is none. ``weights`` [tet_count, K] are of control points."""
+           effect: np.ndarray | None = None) -> "SectionMean":
+        """Prepare the mean by ``effect`` [K, P] of pieces, with their ``weights`` [tet_count, P];
+        None: over control points' parts, of such weights, by length."""
         low, high, fraction, _ = on_cylinders(skeleton, mesh.centroids)
         radius = (1 - fraction) * skeleton.radius[low] + fraction * skeleton.radius[high]
         # A twig's own bending does not contribute to that of the branch which carries it.
-        weights = weights * np.isin(high, skeleton.main_path())[:, None]
-        each = by_length = weights * (np.abs(mesh.volumes) / radius**2)[:, None]
-        if energy is not None:
-            each = weights * energy[:, None]
-            each = np.where(each.sum(axis=0) > 0, each, by_length)
+        each = weights * (np.isin(high, skeleton.main_path()) * np.abs(mesh.volumes)
+                          / radius**2)[:, None]
+        if effect is not None:
+            each = each / np.maximum(each.sum(axis=0), 1e-300) @ effect.T
         share = np.array([
             np.bincount(low, (1 - fraction) * own, skeleton.node_count)
             + np.bincount(high, fraction * own, skeleton.node_count) for own in each.T])
@@ -245,17 +271,6 @@ class SectionMean:
         as so much wood."""
         carrying = 1.0 if section is None else section.bending_factor(radius)
         return self.share @ np.log(np.pi / 4 * radius**4 * carrying)
-
-
-def strain_energy(objective: Objective, values: Values) -> np.ndarray | None:
-    """Strain energy [tet_count] [J] summed over the frames simulated for ``values``; None if a pull
-    is dynamic."""
-    forwards = _slow(objective)
-    if len(forwards) < len(objective.forwards):
-        return None
-    energies = [forward.model_with(values).internal(state).tet_energy for forward in forwards
-                for state in forward.displacements()]
-    return np.sum(energies, axis=0) if energies else None
 
 
 FEWEST = 8

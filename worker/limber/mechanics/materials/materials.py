@@ -1,7 +1,7 @@
 """Lamé coefficients, valid ranges of material values, damping."""
 
 from dataclasses import dataclass
-from typing import overload
+from typing import Any
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 
-MAX_POISSON = 0.495
-"""Above this, the tetrahedra lock; at 0.5, the Lamé coefficients are infinite."""
+MAX_POISSON = 0.49999
+"""Above this, round-off prevails; at 0.5, the Lamé coefficients are infinite."""
 
 
 @dataclass(frozen=True)
@@ -31,22 +31,26 @@ class RayleighDamping:
                              "Negative damping would add energy to the motion.", "Use 0 or more.")
 
 
-@overload
-def lame(young: float, poisson: float) -> tuple[float, float]: ...
-@overload
-def lame(young: np.ndarray, poisson: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
-@overload
-def lame(young: float, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
-def lame(young: float | np.ndarray, poisson: float | np.ndarray,
-         ) -> tuple[float | np.ndarray, float | np.ndarray]:
+def lame(young: Any, poisson: Any) -> tuple[Any, Any]:
     """Return Lamé's lambda and mu [Pa] of Young's modulus [Pa] and Poisson's ratio."""
     return (young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson)))
 
 
-def lame_by_poisson(young: np.ndarray, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of lambda and mu [Pa] to Poisson's ratio."""
-    by_lambda = (1 + 2 * poisson**2) / ((1 + poisson) * (1 - 2 * poisson)) ** 2
-    return young * by_lambda, -young / (2 * (1 + poisson) ** 2)
+def log_bulk_over_shear(poisson: float) -> float:
+    """Return log 3 K / 2 G, which is any number: Poisson's ratio is -1 to 0.5. 0: ratio 0."""
+    return float(np.log((1 + poisson) / (1 - 2 * poisson)))
+
+
+def poisson_of(log_bulk_over_shear: float) -> float:
+    """Return Poisson's ratio of log 3 K / 2 G."""
+    ratio = np.exp(log_bulk_over_shear)
+    return float((ratio - 1) / (1 + 2 * ratio))
+
+
+def lame_by_bulk(young: np.ndarray, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of lambda and mu [Pa] to log 3 K / 2 G, for the same modulus."""
+    by_lambda = (1 + 2 * poisson**2) / (3 * (1 + poisson) * (1 - 2 * poisson))
+    return young * by_lambda, -young * (1 - 2 * poisson) / (6 * (1 + poisson))
 
 
 def per_tet(name: str, value: float | np.ndarray, tet_count: int) -> np.ndarray:
@@ -82,7 +86,7 @@ def check_poisson(poisson: np.ndarray) -> None:
     if poisson.min() <= -1 or poisson.max() > MAX_POISSON:
         raise InputError(f"Poisson's ratio is {worst:g}.",
                          f"It must be above -1 and at most {MAX_POISSON}: at 0.5 the material is "
-                         "incompressible and these elements lock.",
+                         "incompressible.",
                          "Wood has 0.3 to 0.45.")
 
 

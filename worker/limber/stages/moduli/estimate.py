@@ -52,8 +52,8 @@ class Estimate(Result):
     converged: bool = shown("converged", meaning="whether the fit ended at a solution")
     interval: np.ndarray = of_files("its 95 % interval [Pa], shape [K, 2]; NaN if an end is open")
     bending_stiffness: np.ndarray = of_files(
-        "E times the second moment of area [N m^2], the latter a mean over each control point's "
-        "section by strain energy, shape [K]; NaN in a folder of an earlier version")
+        "E times the second moment of area [N m^2], the latter a mean around each control point, "
+        "as the pulls tell it, shape [K]; NaN in a folder of an earlier version")
     bending_interval: np.ndarray = of_files(
         "its 95 % interval [N m^2], shape [K, 2]: narrower than that of E if the scan leaves the "
         "radius uncertain")
