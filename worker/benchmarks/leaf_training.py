@@ -27,7 +27,7 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
 
 _KINDS = (*(f"{source}:leafy" for source in SOURCES), "leafy",
-          *(f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES), "crowns", "2-mm")
+          *(f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES), "2-mm")
 _TREES, _LEAVES, _RATE, _LEAST = 50, 20, 0.2, 50  # number, ends, learning rate, points of an end
 _MOST = 1500  # points of a scan that are learnt from
 LEFT_OUT = ("weber-penn", "dichotomous")

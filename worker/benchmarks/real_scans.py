@@ -449,16 +449,14 @@ def subjects() -> list[str]:
     return ["round", "one-sided", *worlds, *present()]
 
 
-def same_tree_asked(names: str) -> Asked:
-    """Measure of the row of one scan, or of all."""
-    return Asked(f"{names}: unit, shift of 500 km, turn, shuffle, duplicates, outliers, ground, "
-                 "threads; half: length and volume; forks that differ though stated likely",
-                 "2 %; 8 %; 0; no crash")
+SAME_TREE = Asked("scans: unit, shift of 500 km, turn, shuffle, duplicates, outliers, ground, "
+                  "threads; half: length and volume; forks that differ though stated likely",
+                  "2 %; 8 %; 0; no crash")
 
 
-def same_tree_rows(setting: Setting, only: str | None = None) -> list[Row]:
-    """Each changed scan against the scan itself; ``only``: for one scan."""
-    names = [only] if only else subjects()[:4] if setting.quick else subjects()
+def same_tree_rows(setting: Setting) -> list[Row]:
+    """Each changed scan against the scan itself."""
+    names = subjects()[:4] if setting.quick else subjects()
     done = runs(setting, [(name, change) for change in CHANGED for name in names])
     first = {run.task[0]: run for run in sound(done) if run.task[1] == AS_IT_IS}
     crashes = [_why(run) for run in done if run.failure]
@@ -477,7 +475,7 @@ def same_tree_rows(setting: Setting, only: str | None = None) -> list[Row]:
             notes.append(f"{run.task[0]} {run.task[1]} {off:.1%}, {differ} forks ({sure} likely)")
     if not changed and not crashes:
         return []
-    return [Row(*same_tree_asked(only or "scans"),
+    return [Row(*SAME_TREE,
                 f"worst {worst:.1%}; {half:.1%}; {likely} of {every} forks that differ; "
                 f"{len(crashes)} crashes; stated intervals meet in {agree} of {len(changed)}"
                 + "".join(f"; {text}" for text in notes + crashes),

@@ -203,6 +203,7 @@ def _part(kind: str, rows: Callable[[Outcomes], list[Row]], gives: tuple[Asked, 
 
 _WORLD_COUNT, _WORLD_QUICK = 24, 1  # cases of a source and view
 _DRESSED = 6  # cases of a source in leaf
+_WORLDS = ", worlds"
 # Forks found and false, twigs found and false, radius bias, worst volume.
 _LIMITS = {"one-sided": (0.90, 0.08, 0.90, 0.05, 0.04, 0.10),
            "round": (0.96, 0.03, 0.95, 0.03, 0.02, 0.05)}
@@ -297,27 +298,20 @@ def things_rows(setting: Setting) -> list[Row]:
         named + perhaps >= 0.6 * there and not false), one.count)]
 
 
-def world_rows(setting: Setting, source: str | None = None) -> list[Row]:
-    """All rows of generated worlds; of one ``source`` its own."""
-    chosen = [source] if source else list(SOURCES)
+def world_rows(setting: Setting) -> list[Row]:
+    """All rows of generated worlds."""
+    chosen = list(SOURCES)
     count = setting.at_most(_WORLD_COUNT, _WORLD_QUICK)
-    dressed = {} if source else {
-        f"{name}:leafy": setting.at_most(_DRESSED, _WORLD_QUICK) for name in chosen}
+    dressed = {f"{name}:leafy": setting.at_most(_DRESSED, _WORLD_QUICK) for name in chosen}
     done = outcomes(setting, {f"{name}:{view}": count for view in BARE_VIEWS for name in chosen}
                     | dressed)
     rows = [row for view in BARE_VIEWS for name in chosen
             for row in source_rows(name, view, done[f"{name}:{view}"])]
-    rows += probability_rows(_of_worlds(source), [done[f"{name}:{view}"] for name in chosen
+    rows += probability_rows(_WORLDS, [done[f"{name}:{view}"] for name in chosen
                                                   for view in BARE_VIEWS])
-    if source:
-        return rows
     dress = {key: [done[f"{name}:{key}"] for name in chosen]
              for key in (*BARE_VIEWS, "leafy")}
     return [*rows, *dropped_rows(dress["one-sided"] + dress["round"]), *leafy_rows(dress["leafy"])]
-
-
-def _of_worlds(source: str | None) -> str:
-    return f", worlds, {source}" if source else ", worlds"
 
 
 def _together(several: list[Outcomes]) -> Outcomes:
@@ -327,7 +321,7 @@ def _together(several: list[Outcomes]) -> Outcomes:
 WORLDS = {
     "worlds": Part(world_rows, 120, (*(source_asked(source, view) for view in BARE_VIEWS
                                        for source in SOURCES), *probability_asked(
-                                           _of_worlds(None)), DROPPED, LEAFY),
+                                           _WORLDS), DROPPED, LEAFY),
                    grows=True),
     "things": Part(things_rows, 30, (THINGS,), grows=True),
     "worlds-real": Part(real_scans.length_rows, 90, (real_scans.REAL, real_scans.BARE,
@@ -337,7 +331,7 @@ SPARSE = {
     "sparse-real": Part(sparse_scans.real_rows, 60, sparse_scans.REAL, grows=True),
     "perturbations": Part(sparse_scans.perturbation_rows, 90, (sparse_scans.PERTURBATIONS,),
                           grows=True),
-    "peers": Part(peers.rows, 60, peers.PEERS, alone=True)}
+    "peers": Part(peers.rows, 60, peers.PEERS, grows=True, alone=True)}
 PARTS = {
     **SPARSE,
     **WORLDS,
@@ -348,18 +342,7 @@ PARTS = {
     "gaps": _part("gaps", gap_rows, (GAP_ROW,)),
     "2-mm": _part("2-mm", partial(_noise_rows, kind="2 mm"), noise_asked("2 mm")),
     "3-mm": _part("3-mm", partial(_noise_rows, kind="3 mm"), noise_asked("3 mm")),
-    "same-tree": Part(real_scans.same_tree_rows, 60, (real_scans.same_tree_asked("scans"),),
+    "same-tree": Part(real_scans.same_tree_rows, 60, (real_scans.SAME_TREE,),
                       grows=True),
     "root": Part(root_rows, 30, (ROOT_ROW,), grows=True)}
-"""The table, in order of importance; ``--only`` also accepts one source of the worlds, and one scan
-of the same tree's row.
-"""
-PARTS |= {f"worlds:{source}": Part(
-    partial(world_rows, source=source), 60, (
-        *(source_asked(source, view) for view in BARE_VIEWS),
-        *probability_asked(_of_worlds(source))), grows=True, alone=True)
-    for source in SOURCES}
-PARTS |= {f"same-tree:{name}": Part(
-    partial(real_scans.same_tree_rows, only=name), 60, (real_scans.same_tree_asked(name),),
-    grows=True, alone=True)
-    for name in real_scans.subjects()}
+"""The table, in order of importance."""

@@ -179,7 +179,7 @@ def compared(known: Subject, places: np.ndarray, radius: np.ndarray) -> dict[str
                 "own": float(near.mean())}
     if known.truth is not None:
         compared["radius_bias"] = float(np.nanmedian((off / (radius - off))[near])) if (
-            near.any()) else np.nan
+            np.isfinite(off[near]).any()) else np.nan
     return compared
 
 
