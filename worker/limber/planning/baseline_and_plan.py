@@ -539,13 +539,13 @@ def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
 
 
 def _shortest_known(problem: GentleProblem, tree: FoundPath | None, plan: FoundPath) -> FoundPath:
-    """Return the shortest of RRT*'s path, the plan, and these two shortened as far as possible.
-    RRT*'s alone has the error of its samples: it was longer than some plans."""
-    rough = [plan] if tree is None else [tree, plan]
-    shortened = [_shortest(problem, points) for points in distinct([one.points for one in rough])]
-    shortest = min((*rough, *(one for one in shortened if np.isfinite(one.cost))),
+    """Return the shortest of RRT*'s path, which is refined on its length, the plan, and the plan
+    shortened as far as possible: the tree's samples may have led another way."""
+    known = [plan] if tree is None else [tree, plan]
+    shortened = _shortest(problem, plan.points)
+    shortest = min((*known, *([shortened] if np.isfinite(shortened.cost) else [])),
                    key=lambda one: float(arc_lengths(one.points)[-1]))
-    return replace(shortest, history=rough[0].history)
+    return replace(shortest, history=known[0].history)
 
 
 def _shortest(problem: GentleProblem, path: np.ndarray) -> FoundPath:
