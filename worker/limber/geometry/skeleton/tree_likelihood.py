@@ -149,10 +149,10 @@ class PointLikelihood:
     def score(self, skeleton: Skeleton, match: Match | None = None) -> float:
         """The logarithm of the likelihood of the points given a tree, less the cost of its twigs
         and bends, with the likeliest scatter. Only differences between trees of one scan mean
-        something."""
+        something; with a ``match`` those between sensors of one tree, as its bends are left out."""
         density = self.densities(skeleton, match or self.match(skeleton))
         scatter = self.scattered(skeleton, density)
-        bends = float(Bends.of(skeleton).costs(skeleton.nodes).sum())
+        bends = 0.0 if match else float(Bends.of(skeleton).costs(skeleton.nodes).sum())
         return self.log(density @ scatter.shares, scatter, float(self.skin(skeleton).sum()),
                         skeleton.branch_count) - bends
 
