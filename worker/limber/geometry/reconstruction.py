@@ -112,7 +112,10 @@ Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 _OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # columns of cloud.ply that Limber writes
 # A twig is kept if, as seen by a depth camera, it reaches this many radii beyond its parent's axis.
 _SILHOUETTE_REACH = 1.5
-_LEAVES_ASKED = 0.2  # fraction of points on no round axis above which leaves are searched for
+# Fraction of points on no round axis above which leaves are searched for. Deviation of the
+# logarithm of the length where some were cut off, from 12 generated scans: what is left of them
+# lengthens axes by a sixth, and what twigs are likely does not show it.
+_LEAVES_ASKED, _LEAFY_SPREAD = 0.2, 0.21
 
 
 @dataclass(frozen=True)
@@ -265,8 +268,8 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     if settings.leaves == "ask":
         with shown_if_refused(show, prepared, leaves, supports):
             check_agreed(prepared, leaves)
-    return (_skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves) if leaves else (
-        found, prepared, [])
+    return (replace(_skeleton(wood, settings, own, progress.part(0.55, 1.0)),
+                    length_spread=_LEAFY_SPREAD), wood, leaves) if leaves else (found, prepared, [])
 
 
 def _most_off(found: SkeletonResult, settings: ReconstructSettings, supports: list[Part],

@@ -44,7 +44,7 @@ class SkeletonResult:
             :func:`~limber.geometry.skeleton.confidence.likely` returns them.
         leafy: Points show leaves, and axes were placed in their middle.
         length_spread: Standard deviation of the logarithm of the length of the likeliest tree of a
-            thin scan; None where none was searched.
+            thin scan, or of axes from which leaves were cut off; None of others.
     """
 
     skeleton: Skeleton
