@@ -1,5 +1,7 @@
 """Rigid transforms of arrays."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -64,3 +66,15 @@ def test_principal_axes_of_a_box():
     corners = np.array(np.meshgrid([-1, 1], [-3, 3], [-2, 2])).reshape(3, -1).T + [5.0, 0, 1]
     assert np.abs(rigid.principal_axes(corners)) == pytest.approx(np.eye(3)[[1, 2, 0]])
     assert rigid.spreads(corners) == pytest.approx([3, 2, 1])
+
+
+def test_a_curve_through_an_arc_has_no_chords():
+    """Half-way between points 5 mm apart a straight line runs 6 um inside an arc of 0.5 m."""
+    angle = np.arange(0.0, 0.2, 0.01)
+    arc = 0.5 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    curve = partial(rigid.curve_through, 0.5 * angle, arc)
+    middle = curve(0.5 * angle[4:-4] + 0.0025)
+    assert np.abs(np.linalg.norm(middle, axis=1) - 0.5).max() < 1e-6
+    np.testing.assert_allclose(curve(0.5 * angle), arc, atol=1e-15)
+    between = rigid.curve_through(np.r_[0.0, 0.0, 1.0], arc[[0, 0, 1]], np.r_[0.5])
+    np.testing.assert_allclose(between, [(arc[0] + arc[1]) / 2], atol=1e-15)

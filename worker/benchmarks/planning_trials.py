@@ -16,7 +16,7 @@ from benchmarks.table import Asked, Row
 from benchmarks.trials import Trial, column, sound
 from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError, NoPathError
-from limber.core.numerics.rigid import pose_vectors
+from limber.core.numerics.rigid import curve_through, pose_vectors
 from limber.core.progress import SILENT, Progress
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import GRASP_FRACTION
@@ -200,9 +200,11 @@ def _with_binding_force(model: GraspModel, known: EnergyField, start: np.ndarray
         return {"refused": error.seen}
     states = motion.plan.approach.joined(motion.plan.solved)
     moving, excess = motion.summary["in_motion"], np.inf
-    # Every pose again, from rest, at half the spacing: not the states that accepted it.
-    again = resolve_path(model, resample(motion.plan.solved.poses[:, :3], 0.0025),
-                         motion.plan.approach.poses[:, :3])
+    # Not the states that accepted it: from rest, at half the spacing of the gripper's curve.
+    passed = motion.plan.solved.poses[:, :3]
+    arc = arc_lengths(passed)
+    again = resolve_path(model, curve_through(arc, passed, np.linspace(
+        0.0, arc[-1], 2 * len(arc))), motion.plan.approach.poses[:, :3])
     if again.is_whole:
         excess = max(states.force_sizes.max(), again.solved.force_sizes.max()) / cap - 1.0
     return {"accepted_after": len(motion.summary["rounds"]), "moving_seconds": moving["seconds"],

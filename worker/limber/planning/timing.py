@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from limber.core.numerics.rigid import rotations_at
+from limber.core.numerics.rigid import curve_through, rotations_at
 
 _SHARE = np.sqrt(0.5)  # fraction of the acceleration, along and across
 _PIECES = 16  # pieces of an edge, so that speed changes within it
@@ -96,9 +96,7 @@ def times_along(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) 
 def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
              stops: tuple[int, ...] = ()) -> np.ndarray:
     """Return poses [m, 6] [m, rad] at ``instants`` [s] of a timed motion: between stops a curve
-    through positions (Akima's, which hardly overshoots), and shortest turns of rotations."""
-    from scipy.interpolate import Akima1DInterpolator
-
+    through positions, and shortest turns of rotations."""
     knots = law.along[::_PIECES]
     along = law.at(instants)
     found = np.empty((len(along), 6))
@@ -111,11 +109,7 @@ def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
             found[here] = poses[first]
             continue
         distances, asked = knots[passed], np.clip(along[here], knots[first], knots[passed[-1]])
-        found[here, :3] = (
-            Akima1DInterpolator(distances, poses[passed, :3], method="makima")(asked)
-            if len(passed) > 2 else poses[first, :3] + np.outer(
-                (asked - distances[0]) / (distances[1] - distances[0]),
-                poses[passed[1], :3] - poses[first, :3]))
+        found[here, :3] = curve_through(distances, poses[passed, :3], asked)
         found[here, 3:] = rotations_at(distances, poses[passed, 3:], asked)
     return found
 

@@ -76,6 +76,17 @@ def poses_at(times: np.ndarray, poses: np.ndarray, query: np.ndarray) -> np.ndar
     return np.hstack([positions, rotations_at(times, poses[:, 3:], query)])
 
 
+def curve_through(along: np.ndarray, points: np.ndarray, query: np.ndarray) -> np.ndarray:
+    """Return points [m, 3] at ``query`` [m] of a curve through ``points`` [n, 3] at lengths
+    ``along`` [n]: Akima's, which hardly overshoots. A straight line between two points runs inside
+    of it, where a branch that is stiff along itself pulls more than at either."""
+    passed = np.r_[True, np.diff(along) > 1e-9]
+    if passed.sum() < 3:
+        return np.column_stack([np.interp(query, along, axis) for axis in points.T])
+    return scipy.interpolate.Akima1DInterpolator(along[passed], points[passed], method="makima")(
+        np.clip(query, along[0], along[passed][-1]))
+
+
 def matrices(poses: np.ndarray) -> np.ndarray:
     """Return the frames [..., 4, 4] of poses [..., 6]."""
     poses = np.asarray(poses, float)

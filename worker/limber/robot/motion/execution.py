@@ -12,6 +12,7 @@ from limber.cell.reach_and_collision import Blocked
 from limber.core.errors import InputError, NoPathError, Option
 from limber.core.numerics.rigid import (
     composed,
+    curve_through,
     inverted,
     matrices,
     pose_vectors,
@@ -131,6 +132,9 @@ def _path_segments(cell: Cell, poses: np.ndarray,
     approach = densely(pose_vectors(base @ np.array([back, held[0]])))
     steps = pose_vectors(base @ held)
     path = densely(steps)
+    # As the branch was solved in motion; straight between the plan's poses, its force was up to 7 %
+    # greater.
+    path[:, :3] = curve_through(_arc(steps), steps[:, :3], _arc(path))
     tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
     flange = matrices(np.vstack([approach, path[1:]])) @ tool
     found, refusals = follow(cell.arm, flange, joint_limits=cell.joint_limits,
@@ -141,14 +145,16 @@ def _path_segments(cell: Cell, poses: np.ndarray,
     return [_PathSegment(rotation, approach, steps, path, flange, joints) for joints in found]
 
 
+def _arc(poses: np.ndarray) -> np.ndarray:
+    return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1))]
+
+
 def _timed(cell: Cell, predicted: Predicted, segment: _PathSegment, speed: float) -> RobotMotion:
     """Return the motion on a path, with the expected wrench along it."""
     limits, steps, path = cell.limits, segment.steps, segment.path
     times = along(path, speed, limits.acceleration_m_s2, turn_speed=0.8 * limits.turn_speed_rad_s)
     # Predictions are at the plan's poses; they are interpolated to the dense poses along the path.
-    arc = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
-    dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
-    expected = interpolated(predicted, arc, dense).felt(cell, path[0])
+    expected = interpolated(predicted, _arc(steps), _arc(path)).felt(cell, path[0])
     coming = along(segment.approach, speed, limits.acceleration_m_s2)
     first = len(segment.approach)
     # The last pose of the approach is the first of the path.
