@@ -107,15 +107,21 @@ def test_a_start_without_equilibrium_is_stiffened(objective, monkeypatch):
     assert found.young == pytest.approx(TRUTH * np.exp(2 * LONGEST_STEP))
 
 
-def test_decades_without_equilibrium_are_no_minimum(objective, monkeypatch):
-    """Without force the scale is searched; what fails there is too soft."""
+@pytest.mark.parametrize("has_force", [False, True])
+def test_decades_without_equilibrium_are_no_minimum(objective, monkeypatch, has_force):
+    """Without force, or with one that no rod explains, the scale is searched; what fails there is
+    too soft. A rod that explains nothing is likeliest where it does not move, at the bound."""
     def evaluate(self, free, **_options):
         known = None if free[0] < np.log(1e7) else Evaluation(
             free, np.array([1.0 + abs(free[0] - np.log(1e8))]), None, 0.0, ())
         return known
 
     monkeypatch.setattr(Objective, "evaluate", evaluate)
-    monkeypatch.setattr(objective.forwards[0], "skeleton", None)
+    if has_force:
+        begun = initial_modulus.BeamStart(Values(np.full(4, 1e11), 0.36, 900.0), 0.0, {})
+        monkeypatch.setattr(initial_modulus, "beam_start", lambda *_: begun)
+    else:
+        monkeypatch.setattr(objective.forwards[0], "skeleton", None)
     for young in (1e4, 1e8, 1e10):
         start = initial_modulus.scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
         assert start.young == pytest.approx(1e8, rel=0.3)

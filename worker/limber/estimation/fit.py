@@ -180,7 +180,7 @@ class _Strategy:
         beams = [] if any(forward.is_dynamic for forward in forwards) else starts.beams_of(forwards)
         if beams:
             begun = starts.beam_start(beams, self.subject.start)
-            start = begun.values
+            start = None if begun.is_immobile else begun.values
             if begun.explained < starts.EXPLAINED:
                 self.progress.warn(starts.unexplained(begun))
             shifts = starts.far_from_stated(beams, begun)

@@ -216,6 +216,11 @@ class BeamStart:
     explained: float
     zeros: Mapping[str, np.ndarray]
 
+    @property
+    def is_immobile(self) -> bool:
+        """Whether the stiffest rod is the best: then it is no modulus that was found."""
+        return bool(self.values.young.max() >= 0.9 * YOUNG_BOUNDS_PA[1])
+
 
 EXPLAINED = 0.5
 """Part of the recorded motion that some modulus has to explain. Chosen: sound pulls reach 0.9."""
@@ -284,13 +289,15 @@ def beam_start(beams: Sequence[Beam], base: Values) -> BeamStart:
 
 def scaled_start(objective: Objective, values: Values) -> Values:
     """Return moduli under which the branch stands and answers the measured force as recorded. A
-    fast pull is fitted step by step; without a force some decades are tried."""
+    fast pull is fitted step by step; without a force, or where a rod had best not move, some
+    decades are tried."""
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
     beams = beams_of(objective.forwards)
-    if not beams:
+    begun = beam_start(beams, values) if beams else None
+    if begun is None or begun.is_immobile:
         return _scanned(objective, standing(objective, values))
-    return standing(objective, beam_start(beams, values).values)
+    return standing(objective, begun.values)
 
 
 def standing(objective: Objective, values: Values) -> Values:
