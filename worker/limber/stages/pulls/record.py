@@ -141,9 +141,10 @@ class RecordPull(BranchStage):
             # Nothing is recorded of a stop before the pull: the name stays free.
             result = _finish(branch, self, ended) if ended["sample_count"] else ended
         if ended["ended"] != "reached":
+            left = (f"{ended['sample_count']} samples are in pulls/{name}." if ended["sample_count"]
+                    else "No sample was recorded.")
             raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
-                             f"{ended['after_stop']['outcome']} {result['sample_count']} samples "
-                             f"are in pulls/{name}.",
+                             f"{ended['after_stop']['outcome']} {left}",
                              "Check the branch and the robot before anything moves.", result=result)
         return result
 
