@@ -268,8 +268,11 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     if settings.leaves == "ask":
         with shown_if_refused(show, prepared, leaves, supports):
             check_agreed(prepared, leaves)
-    return (replace(_skeleton(wood, settings, own, progress.part(0.55, 1.0)),
-                    length_spread=_LEAFY_SPREAD), wood, leaves) if leaves else (found, prepared, [])
+    if not leaves:
+        return found, prepared, []
+    bare = _skeleton(wood, settings, own, progress.part(0.55, 1.0))
+    spread = float(np.hypot(_LEAFY_SPREAD, bare.length_spread or 0.0))
+    return replace(bare, length_spread=spread), wood, leaves
 
 
 def _most_off(found: SkeletonResult, settings: ReconstructSettings, supports: list[Part],

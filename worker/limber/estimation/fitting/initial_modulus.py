@@ -289,8 +289,8 @@ def beam_start(beams: Sequence[Beam], base: Values) -> BeamStart:
 
 def scaled_start(objective: Objective, values: Values) -> Values:
     """Return moduli under which the branch stands and answers the measured force as recorded. A
-    fast pull is fitted step by step; without a force, or where a rod had best not move, some
-    decades are tried."""
+    fast pull is fitted step by step; without a force, or where the stiffest rod fits best,
+    some decades are tried."""
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
     beams = beams_of(objective.forwards)

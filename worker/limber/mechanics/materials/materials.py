@@ -11,7 +11,9 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 
 MAX_POISSON = 0.49999
-"""Above this, round-off prevails; at 0.5, the Lamé coefficients are infinite."""
+"""At 0.5 the Lamé coefficients are infinite. A cantilever of quadratic tetrahedra is 3.5 % stiffer
+here than at 0.3; linear ones lock long before, fivefold at 0.49.
+"""
 
 
 @dataclass(frozen=True)
