@@ -25,7 +25,7 @@ def main(arguments: list[str]) -> None:
     settings.reconstruct.unit = given.unit
     # Operators take the panels' settings as keyword arguments; an error raises RuntimeError.
     bpy.ops.limber.import_cloud(filepath=str(given.scan.resolve()))
-    bpy.ops.limber.reconstruct(young=given.young)
+    bpy.ops.limber.reconstruct(use_young=True, young=given.young)
     bpy.ops.limber.open_result()
     branch = bpy.context.scene.objects[Path(settings.branch_folder).stem]
     x, y, z = max((vertex.co for vertex in branch.data.vertices), key=lambda place: place[2])

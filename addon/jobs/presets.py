@@ -27,7 +27,8 @@ class LIMBER_OT_material(bpy.types.Operator):
 
     def execute(self, context):
         known, settings = _KNOWN[self.material], context.scene.limber
-        settings.reconstruct.young, settings.reconstruct.density = known["young"], known["density"]
+        settings.reconstruct.young, settings.reconstruct.use_young = known["young"], True
+        settings.reconstruct.density = known["density"]
         settings.scene.strength, settings.scene.use_strength = known["strength"], True
         self.report({"INFO"}, f"{known['title']} is set. Reconstruct again to use it. {_SOURCE}")
         return {"FINISHED"}

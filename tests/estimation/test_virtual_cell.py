@@ -11,11 +11,10 @@ from limber.core.numerics.rigid import rotated
 from limber.estimation.settings import PullSpec, VirtualPullSettings
 from limber.estimation.simulated_pull import (
     DEFAULT_YOUNG_PA,
-    MOST_TURN,
     CellErrors,
     true_branch,
-    turn_by_weight,
 )
+from limber.geometry.skeleton.assumed_modulus import MOST_TURN, assumed_young, turn_by_weight
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.recording import (
     EXACT,
@@ -100,14 +99,17 @@ def test_an_assumed_modulus_carries_the_branch():
     for length in (0.4, 1.6):
         rod = Skeleton.from_edges(np.linspace((0, 0, 0), (length, 0, 0), count),
                                   np.arange(-1, count - 1), np.full(count, radius))
-        stiff = true_branch(rod, PullSpec(young=(1e8,) * 4))
         turn = 4 * 900 * GRAVITY[2] * length**3 / (6 * 1e8 * radius**2)
-        assert turn_by_weight(stiff, 900.0) == pytest.approx(-turn, rel=0.02)
+        young = np.full(count, 1e8)
+        assert turn_by_weight(rod, young, 900.0, GRAVITY) == pytest.approx(-turn, rel=0.02)
+        assert assumed_young(rod, 900.0, GRAVITY) == pytest.approx(
+            1e8 * max(1.0, -turn / MOST_TURN), rel=0.05)
         assumed = true_branch(rod, PullSpec(density=900.0))
         ratio = assumed.young / DEFAULT_YOUNG_PA
         assert np.ptp(ratio) == pytest.approx(0)
         assert ratio[0] == 1.0 if length < 1 else ratio[0] > 1.5
-        assert turn_by_weight(assumed, 900.0) == pytest.approx(MOST_TURN) or ratio[0] == 1.0
+        turned = turn_by_weight(rod, assumed.young_at(rod.nodes), 900.0, GRAVITY)
+        assert turned == pytest.approx(MOST_TURN) or ratio[0] == 1.0
 
 
 def test_each_branch_has_its_own_shape_and_cell(branch_folder, tmp_path, small, small_bench):

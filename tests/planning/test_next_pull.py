@@ -126,7 +126,7 @@ def test_no_pull_within_the_strain_is_said(subject, monkeypatch):
                         1.0)
     found = iter([made, *([None] * 20)])
     monkeypatch.setattr(next_pull, "_tried", lambda *_: next(found))
-    with pytest.raises(WorkError, match=r"7 of 8 are impossible, and the gentlest .* 5 %") as error:
+    with pytest.raises(WorkError, match=r"6 of 7 are impossible, and the gentlest .* 5 %") as error:
         suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=0.01)
     # No limit of the force was set: it is not advised to raise it.
     assert "--max-strain 0.0525" in str(error.value) and "--max-force" not in str(error.value)

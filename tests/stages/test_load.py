@@ -7,6 +7,7 @@ import pytest
 
 from limber.core.errors import InputError, LimberError
 from limber.core.json_values import plain, stored
+from limber.core.progress import Progress
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.load_effects import load_effects
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
@@ -64,6 +65,25 @@ def test_a_load_is_needed_and_lies_on_the_branch(tip):
                             ({"fruit": ((9.0, 0.0, 0.0, 1.0),)}, "away from the branch")):
         with pytest.raises(InputError, match=words):
             ApplyLoads(branch_folder=EXAMPLE, **settings).run()
+
+
+def test_an_assumed_modulus_is_said(branch_folder):
+    """Before an estimate whoever computes is told what stiffness that is of; not if it is stated,
+    or estimated."""
+    warned = []
+    progress = Progress(on_warning=warned.append)
+    branch = Branch.open(branch_folder)
+    branch.manifest.stages["reconstruct"].settings["young"] = None
+    load_branch(branch, progress=progress)
+    assert [str(each) for each in warned] == [
+        "Young's modulus is not known: 1e+08 Pa is assumed, and forces, energies and strains are "
+        "as uncertain as that. Estimate it (`limber estimate`), or state it (`limber reconstruct "
+        "--young`)."]
+    load_branch(branch, young=2e9, progress=progress)
+    branch.manifest.stages["reconstruct"].settings["young"] = 1e8
+    load_branch(branch, progress=progress)
+    load_branch(Branch.open(EXAMPLE), progress=progress)
+    assert len(warned) == 1
 
 
 @pytest.mark.slow

@@ -41,7 +41,8 @@ UNKNOWN_SCALE = 1.15
 _FIRM = 1e-4
 """Fraction of the variance by which moduli of one group may differ."""
 _PROBE_REACH = 0.15  # fraction of the arc length at which positions and directions are compared
-_REACHES = (0.05, 0.1, 0.25, 0.35)  # fractions tried for the best of them
+_SHARES = (0.25, 0.5, 0.9)  # of the reach at which a limit is met, tried for the best of them
+_MOST_REACH = 0.35
 _DIRECTIONS = 4
 _GOOD = 2  # positions and directions for which other reaches are tried
 _FRAMES = 12  # simulated; each counts for all frames of a recording at its position
@@ -162,6 +163,10 @@ class ExpectedPull:
         """Information per percent of strain."""
         return self.bits / (100.0 * self.peak_strain)
 
+    def room(self, max_strain: float, max_force: float) -> float:
+        """About how many times as far it could go within the limits."""
+        return min(max_strain / self.peak_strain, max_force / self.peak_force)
+
 
 @dataclass(frozen=True)
 class Suggested:
@@ -175,15 +180,16 @@ class Suggested:
 def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
             fractions: tuple[float, ...], *, max_strain: float, max_force: float = np.inf,
             workers: int | None = None, progress: Progress = SILENT) -> Suggested:
-    """Return pulls by information per percent of strain: places and directions at one travel, other
-    travels for the best. WorkError if no pull is within the limits."""
+    """Return pulls by information per percent of strain: places and directions at one travel, for
+    the best those that take a share of the limits. WorkError if no pull is within the limits."""
     phases = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     first = [PullChoice(fraction, float(phase), _PROBE_REACH)
              for fraction in fractions for phase in phases]
     found = _all(first, subject, values, known, cell, workers, progress.part(0.0, 0.6))
     best = sorted((one for one in found if one is not None),
                   key=lambda one: -one.bits_per_percent)[:_GOOD]
-    found += _all([replace(one.choice, reach=reach) for one in best for reach in _REACHES],
+    found += _all([replace(one.choice, reach=min(share * one.choice.reach * one.room(
+        max_strain, max_force), _MOST_REACH)) for one in best for share in _SHARES],
                   subject, values, known, cell, workers, progress.part(0.6, 1.0))
     made = sorted((one for one in found if one is not None), key=lambda one: -one.bits_per_percent)
     fit = [one.peak_strain <= max_strain and one.peak_force <= max_force for one in made]

@@ -24,6 +24,7 @@ from limber.estimation.settings import PullSpec
 from limber.estimation.uncertainty.model_error import refined
 from limber.geometry.cloud.camera import D455, Camera, write_camera
 from limber.geometry.shape_samples import reshaped, sample_skeletons
+from limber.geometry.skeleton.assumed_modulus import MOST_TURN, turn_by_weight
 from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
 from limber.geometry.tets.tet_mesh import TetMesh, base_nodes
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
@@ -128,8 +129,6 @@ BODY_LIMIT = 25_000
 SHAPE_TRIES = 8
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
-MOST_TURN = 0.2
-"""Turn of an end by the branch's own weight [rad] up to which an assumed modulus is taken."""
 
 _PULL_TURN = 2.0  # angle by which the direction of a pull turns [rad]: both bending axes are seen
 
@@ -196,25 +195,9 @@ def true_branch(skeleton: Skeleton, settings: PullSpec, *,
     found = TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
                        np.array(young if len(young) else DEFAULT_YOUNG_PA, float), gravity,
                        is_meshed=body is not None, source=source)
-    return found if len(young) else replace(
-        found, young=found.young * max(1.0, turn_by_weight(found, settings.density) / MOST_TURN))
-
-
-def turn_by_weight(branch: TrueBranch, density: float) -> float:
-    """The most that the weight of a branch turns one of its ends [rad], by beam theory."""
-    tree = branch.skeleton
-    steps = tree.steps
-    weight = density * np.pi * tree.radius**2 * steps
-    moment, turn = weight[:, None] * tree.nodes, np.zeros(tree.node_count)
-    for node in range(tree.node_count - 1, 0, -1):
-        weight[tree.parent[node]] += weight[node]
-        moment[tree.parent[node]] += moment[node]
-    bending = np.cross(moment - weight[:, None] * tree.nodes, branch.gravity)
-    stiffness = branch.young_at(tree.nodes) * np.pi * tree.radius**4 / 4
-    for node in range(1, tree.node_count):
-        turn[node] = turn[tree.parent[node]] + (
-            np.linalg.norm(bending[node]) / stiffness[node] * steps[node])
-    return float(turn.max())
+    turn = 0.0 if len(young) else turn_by_weight(
+        skeleton, found.young_at(skeleton.nodes), settings.density, gravity)
+    return replace(found, young=found.young * max(1.0, turn / MOST_TURN))
 
 
 def _drawing(source: str, stream: int) -> np.random.Generator:

@@ -1,6 +1,6 @@
 """Bodies given without a scan, as a surface, cylinders or sections, to tetrahedra."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,12 @@ from limber.geometry.cloud.preparation import size_doubts
 from limber.geometry.io.formats import Format, known_format
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
 from limber.geometry.io.surfaces import SURFACES
-from limber.geometry.reconstruction import gravity_after, mesh_skeleton, peak_memory_mb
+from limber.geometry.reconstruction import gravity_after, marked, mesh_skeleton, numbers_of
 from limber.geometry.settings import MeshSurfaceSettings, ReconstructSettings
-from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, upright_rotation
+from limber.geometry.skeleton.skeleton import Skeleton, upright_rotation
 from limber.geometry.skeleton.sweep import bending_factor, frames, resample, rings, tangents
 from limber.geometry.surface.surface import Surface
-from limber.geometry.tets.tet_mesh import TetMesh, mark, measure_quality
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import tetrahedralise
 from limber.geometry.tets.tree_sweep import swept
 
@@ -62,28 +62,17 @@ def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
             time_limit=_SECONDS, stop_energy=10.0, progress=progress.part(0.1, 0.9))
     except MeshingError as error:  # there are no axes to sweep along
         raise MeshingError(error.seen, error.why, "Simplify the surface.") from error
-    mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
-                density=settings.density, fractions=FRACTIONS,
-                grasp_fraction=settings.grasp_fraction)
-    mesher = "ftetwild (cached)" if cached else "ftetwild"
+    return _marked_body(alignment, skeleton, surface, mesh, settings,
+                        "ftetwild (cached)" if cached else "ftetwild")
+
+
+def _marked_body(alignment: Alignment, skeleton: Skeleton, surface: Surface, mesh: TetMesh,
+                 settings: MeshSurfaceSettings, mesher: str) -> MeshedBody:
+    gravity = gravity_after(alignment, settings.up)
+    mesh = marked(mesh, skeleton, settings, gravity)
     return MeshedBody(alignment, skeleton, surface, mesh, numbers_of(
-        surface, skeleton, mesh, alignment, settings, mesher))
-
-
-def numbers_of(surface: Surface, skeleton: Skeleton, mesh: TetMesh, alignment: Alignment,
-               settings: MeshSurfaceSettings, mesher: str) -> dict[str, Any]:
-    """Result of the stage for a body."""
-    quality = measure_quality(mesh, surface.volume, skeleton, surface)
-    return {
-        "point_count": len(surface.vertices), "node_count": skeleton.node_count,
-        "branch_count": 1, "length_m": skeleton.length, "main_length_m": skeleton.length,
-        "radius_min_m": float(skeleton.radius.min()),
-        "radius_max_m": float(skeleton.radius.max()), "clamped_radius_count": 0,
-        "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
-        "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count, "mesher": mesher,
-        "watertight": True, "mesh_quality": quality.as_dict(),
-        "peak_memory_mb": peak_memory_mb(),
-        "gravity_m_s2": gravity_after(alignment, settings.up)}
+        skeleton, surface, mesh, mesher, skeleton) | {
+            "point_count": len(surface.vertices), "gravity_m_s2": gravity})
 
 
 def section_axis(surface: Surface, root: np.ndarray | None) -> Skeleton:
@@ -254,13 +243,11 @@ def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
     alignment, surface, skeleton = aligned_body(surface, skeleton, UNIT_METRES[settings.unit],
                                                 settings)
     turn = np.array(alignment.rotation)
-    mesh = mark(TetMesh((mesh.nodes - sections.axis[0]) @ turn.T, mesh.tets).quadratic(), skeleton,
-                young=settings.young, poisson=settings.poisson, density=settings.density,
-                fractions=FRACTIONS, grasp_fraction=settings.grasp_fraction)
+    body = _marked_body(alignment, skeleton, surface, TetMesh(
+        (mesh.nodes - sections.axis[0]) @ turn.T, mesh.tets).quadratic(), settings, "sweep")
     masses = [{"kind": "table", "attached_m": node.tolist(), "mass_kg": float(mass)}
               for node, mass in zip(skeleton.nodes, sections.mass, strict=True) if mass > 0]
-    numbers = numbers_of(surface, skeleton, mesh, alignment, settings, "sweep")
-    return MeshedBody(alignment, skeleton, surface, mesh, numbers | {
+    return replace(body, numbers=body.numbers | {
         "hung_mass_kg": float(sections.mass.sum())}), masses
 
 
@@ -327,7 +314,8 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
     alignment, skeleton = _aligned(read, scale, settings)
     meshed = mesh_skeleton(skeleton, ReconstructSettings(
         young=settings.young, poisson=settings.poisson, density=settings.density,
-        grasp_fraction=settings.grasp_fraction, leave_out=True), progress)
+        grasp_fraction=settings.grasp_fraction, leave_out=True),
+        gravity_after(alignment, settings.up), progress)
     return MeshedBody(alignment, skeleton, meshed.surface, meshed.mesh, meshed.numbers | {
         "point_count": len(meshed.surface.vertices),
         "gravity_m_s2": gravity_after(alignment, settings.up)}), meshed.masses

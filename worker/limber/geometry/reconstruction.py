@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.alignment import Alignment
-from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
+from limber.core.constants import GRAVITY, STANDARD_GRAVITY, UNIT_METRES
 from limber.core.errors import InputError, Option, places_moved
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
@@ -37,8 +37,9 @@ from limber.geometry.pruned_twigs import (
     touching_texts,
     twig_mass,
 )
-from limber.geometry.settings import ESTIMATORS, OPEN, ReconstructSettings
+from limber.geometry.settings import ESTIMATORS, OPEN, BodySettings, ReconstructSettings
 from limber.geometry.skeleton.alternatives import alternatives, entries
+from limber.geometry.skeleton.assumed_modulus import assumed_young
 from limber.geometry.skeleton.edits import Edit, SetRoot, edited
 from limber.geometry.skeleton.plausibility import (
     RESOLVED,
@@ -54,7 +55,6 @@ from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import without_hidden_twigs
 from limber.geometry.skeleton.search_result import FoundSkeleton, SkeletonResult, result_of_skeleton
 from limber.geometry.skeleton.skeleton import (
-    FRACTIONS,
     INTERPOLATED,
     LIMITED,
     Skeleton,
@@ -64,7 +64,7 @@ from limber.geometry.skeleton.skeletonise import Apart, skeletonise
 from limber.geometry.surface.surface import Surface, check_surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets.tet_mesh import TetMesh, mark, measure_quality
-from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
+from limber.geometry.tets.tetrahedra import mesh_branch
 
 # The classes of a refused scan's points, as a coloured cloud to look at.
 
@@ -232,8 +232,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     if edits:
         found = _edited(found, [edit.aligned(alignment) for edit in edits], progress)
         cloud = labelled(cloud, found.skeleton)
-    meshed = mesh_skeleton(found.skeleton, settings, progress.part(0.55, 0.98))
     gravity = gravity_after(alignment, settings.up)
+    meshed = mesh_skeleton(found.skeleton, settings, gravity, progress.part(0.55, 0.98))
     hung: list[dict[str, Any]] = []
     if leaves:
         cloud = _with_leaves(prepared, leaves, alignment, found.skeleton)
@@ -333,12 +333,22 @@ def gravity_after(alignment: Alignment, up: tuple[float, float, float]) -> np.nd
     return -STANDARD_GRAVITY * np.array(alignment.rotation) @ unit
 
 
+def marked(mesh: TetMesh, skeleton: Skeleton, settings: BodySettings,
+           gravity: Sequence[float] | np.ndarray) -> TetMesh:
+    """Return the mesh with the settings' material and grasp; Young's modulus is assumed if it is
+    not stated, for ``gravity`` [m/s^2]."""
+    return mark(mesh, skeleton, poisson=settings.poisson, density=settings.density,
+                young=settings.young or assumed_young(skeleton, settings.density, gravity),
+                grasp_fraction=settings.grasp_fraction)
+
+
 def mesh_skeleton(skeleton: Skeleton, settings: ReconstructSettings,
+                  gravity: Sequence[float] | np.ndarray = GRAVITY,
                   progress: Progress = SILENT) -> MeshedBranch:
-    """Make surface and mesh of an aligned skeleton."""
+    """Make surface and mesh of an aligned skeleton, under ``gravity`` [m/s^2]."""
     kept, masses = leave_out_twigs(skeleton, settings)
     surface = branch_surface(kept)
-    check = check_surface(surface).require()
+    check = check_surface(surface).require().as_dict()
     progress(0.1, "surface", faces=len(surface.faces))
     meshed = mesh_branch(kept, settings, progress=progress.part(0.1, 0.9))
     for text in meshed.warnings:
@@ -349,31 +359,30 @@ def mesh_skeleton(skeleton: Skeleton, settings: ReconstructSettings,
     touching = touching_runs(kept)
     for text in touching_texts(surface.handle_count, touching):
         progress.warn(text)
-    mesh = mark(meshed.mesh, kept, young=settings.young, poisson=settings.poisson,
-                density=settings.density, fractions=FRACTIONS,
-                grasp_fraction=settings.grasp_fraction)
+    mesh = marked(meshed.mesh, kept, settings, gravity)
     progress(1.0, "mesh", tets=mesh.tet_count)
-    numbers = _numbers(skeleton, surface, check.as_dict(), meshed, kept) | {
+    numbers = numbers_of(skeleton, surface, meshed.mesh, meshed.mesher, kept) | {
+        "watertight": check["watertight"], "surface_check": check,
+        "radius_sigma_median_m": float(np.median(skeleton.radius_sigma)),
+        "interpolated_radius_count": int((skeleton.radius_state == INTERPOLATED).sum()),
         "left_out_mass_kg": sum(m["mass_kg"] for m in masses), "left_out_twigs": len(masses),
         "surface_handles": surface.handle_count, "touching": touching}
     return MeshedBranch(skeleton, surface, mesh, masses, numbers)
 
 
-def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed: MeshResult,
-             kept: Skeleton) -> dict[str, Any]:
-    quality = measure_quality(meshed.mesh, surface.volume, kept, surface)
+def numbers_of(skeleton: Skeleton, surface: Surface, mesh: TetMesh, mesher: str,
+               kept: Skeleton) -> dict[str, Any]:
+    """Result of the stage for a mesh of the ``kept`` part of a skeleton."""
+    quality = measure_quality(mesh, surface.volume, kept, surface)
     return {
         "node_count": skeleton.node_count, "branch_count": skeleton.branch_count,
         "length_m": skeleton.length, "main_length_m": float(
             skeleton.arc_length[skeleton.main_path()[-1]]),
         "radius_min_m": float(skeleton.radius.min()), "radius_max_m": float(skeleton.radius.max()),
-        "radius_sigma_median_m": float(np.median(skeleton.radius_sigma)),
         "clamped_radius_count": int((skeleton.radius_state == LIMITED).sum()),
-        "interpolated_radius_count": int((skeleton.radius_state == INTERPOLATED).sum()),
         "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
-        "tet_count": meshed.mesh.tet_count, "mesh_node_count": meshed.mesh.node_count,
-        "mesher": meshed.mesher, "watertight": check["watertight"], "surface_check": check,
-        "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb()}
+        "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count, "mesher": mesher,
+        "watertight": True, "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb()}
 
 
 def peak_memory_mb() -> float:

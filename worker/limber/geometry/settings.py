@@ -104,21 +104,43 @@ class MeshSettings(Settings):
         2.5, gt=0.3, le=8, description="Distance between cross-sections in local radii.")
 
 
-class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
+class BodySettings(Settings):
+    """Settings of any branch with tetrahedra: its material, grasp and up direction."""
+
+    groups: ClassVar[Groups] = {
+        "material": ("young", "poisson", "density", "density_sigma"),
+        "mesh": ("grasp_fraction",),
+    }
+
+    up: Direction = Field(
+        (0.0, 0.0, 1.0), description="The up direction in the file's axes.")
+    young: float | None = Field(
+        None, gt=0, description="Young's modulus until it is estimated [Pa]. Default: assumed, so "
+        "that the branch carries itself.")
+    poisson: float = Field(POISSON, ge=0, lt=0.5, description="Poisson's ratio; if given, to 0.03.")
+    density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
+    density_sigma: float = Field(
+        DENSITY_SIGMA, ge=0, le=1, description="Relative standard deviation of the density: 0.02 "
+        "where a piece of the branch was weighed.")
+    grasp_fraction: float = Field(
+        GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the main "
+            "path.")
+
+    _young = field_validator("young")(possible_young)
+    _density = field_validator("density")(possible_density)
+
+
+class ReconstructSettings(BodySettings, PreparationSettings, SkeletonSettings, MeshSettings):
     """All settings of a scan's reconstruction."""
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
         "shape": ("twig_radius", "leaves", "unexplained", "leave_out"),
-        "material": ("young", "poisson", "density", "density_sigma"),
-        "mesh": ("grasp_fraction",),
     }
     common = ("unit", "up", "root", "leaves", "plants", "crop")
 
     unit: Literal["m", "cm", "mm", "in", "um"] = Field(
         "m", description="Unit of the file, if it does not state one.")
-    up: Direction = Field(
-        (0.0, 0.0, 1.0), description="The up direction in the file's axes.")
     root: tuple[float, float, float] | Literal["auto"] | None = Field(
         None, description="A point near the root, in the file's coordinates. auto: the likeliest "
         "end, however unlikely. Default: the likeliest end, but stop if its probability is below "
@@ -140,47 +162,21 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     twig_radius: float = Field(
         0.0, ge=0, description="Leave twigs thinner than this [m] out of the mesh, and keep "
             "their mass.")
-    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
-    poisson: float = Field(POISSON, ge=0, lt=0.5, description="Poisson's ratio; if given, to 0.03.")
-    density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
-    density_sigma: float = Field(
-        DENSITY_SIGMA, ge=0, le=1, description="Relative standard deviation of the density: 0.02 "
-        "where a piece of the branch was weighed.")
-    grasp_fraction: float = Field(
-        GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the main "
-            "path.")
-
-    _young = field_validator("young")(possible_young)
-    _density = field_validator("density")(possible_density)
 
 
-class MeshSurfaceSettings(Settings):
+class MeshSurfaceSettings(BodySettings):
     """Settings of a closed surface."""
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
-        "mesh": ("grasp_fraction",),
-        "material": ("young", "poisson", "density", "density_sigma"),
     }
     common = ("unit", "root")
 
     unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
-    up: Direction = Field(
-        (0.0, 0.0, 1.0), description="The up direction in the file's axes.")
     root: tuple[float, float, float] | None = Field(
         None, description="A point near the fixed end, in the file's coordinates. Default: the "
         "thicker end.")
     upright: bool = Field(True, description="Turn the long axis to z, and gravity with it.")
-    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
-    poisson: float = Field(POISSON, ge=0, lt=0.5, description="Poisson's ratio; if given, to 0.03.")
-    density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
-    density_sigma: float = Field(
-        DENSITY_SIGMA, ge=0, le=1, description="Relative standard deviation of the density.")
-    grasp_fraction: float = Field(
-        GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the axis.")
-
-    _young = field_validator("young")(possible_young)
-    _density = field_validator("density")(possible_density)
 
 
 class GeneratedSettings(Settings):

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON, UNIT_METRES
-from limber.core.errors import Command, InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.reading import FileContent, read_json_as
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimate_file import read_estimate
@@ -165,8 +165,21 @@ def load_branch(branch: Branch, *, gravity: bool = True, loaded: bool = False,
             and too soft to carry itself.
     """
     model = load_model(branch, gravity=gravity, **overrides)
+    if overrides.get("young") is None:
+        warn_of_assumed_young(branch, model.young, progress)
     hanging = hang(model, load_targets(branch), loaded=loaded, progress=progress)
     return replace(hanging, grasp_point=load_grasp_point(branch))
+
+
+def warn_of_assumed_young(branch: Branch, young: np.ndarray, progress: Progress) -> None:
+    """Warn if Young's modulus in the mesh [Pa] is neither estimated nor stated."""
+    made_by = branch.manifest.files["mesh.vtu"].stage
+    if made_by in ("reconstruct", "mesh") and branch.manifest.stages[made_by].settings.get(
+            "young", young) is None:
+        progress.warn(Text(
+            f"Young's modulus is not known: {np.median(young):.2g} Pa is assumed, and forces, "
+            "energies and strains are as uncertain as that. Estimate it (", Command("estimate"),
+            "), or state it (", Command(made_by, Option("young")), ")."))
 
 
 def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDamping:

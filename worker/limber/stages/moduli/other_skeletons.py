@@ -102,7 +102,7 @@ def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull
     skeleton = edited(load_skeleton(branch), [
         edit.aligned(branch.manifest.alignment) for edit in graph.edits])
     meshed = mesh_skeleton(skeleton, ReconstructSettings.model_validate(
-        branch.manifest.stages["reconstruct"].settings))
+        branch.manifest.stages["reconstruct"].settings), branch.gravity)
     leaves = [mass for mass in load_masses(branch) if mass.get("kind") == "leaf"]
     subject = subject_of(meshed.mesh, skeleton, hung_masses(
         [*meshed.masses, *leaves], load_targets(branch)), branch.gravity, settings)

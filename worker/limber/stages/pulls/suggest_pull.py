@@ -110,6 +110,7 @@ class SuggestPull(KeptStage, BranchStage):
             WorkError: no pull keeps the limits.
         """
         from limber.estimation.next_pull import suggest
+        from limber.store.loading import warn_of_assumed_young
 
         if any(not 0.0 < fraction <= 1.0 for fraction in self.fractions):
             raise InputError(Text(Option("fractions", self.fractions), "."),
@@ -125,6 +126,7 @@ class SuggestPull(KeptStage, BranchStage):
             return branch.manifest.stages["suggest-pull"].result
         with branch.stage("suggest-pull", self, reads=reads) as stage:
             subject, values, known = _state(branch)
+            warn_of_assumed_young(branch, values.young, progress)
             cell = _cell(branch)
             most = np.inf if self.max_force is None else self.max_force
             found = suggest(subject, values, known, cell, self.fractions, max_force=most,

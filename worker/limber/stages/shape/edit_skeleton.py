@@ -264,7 +264,8 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     warnings = list(made.result.get("skeleton_warnings", []))
     leaves = [mass for mass in load_masses(branch) if mass.get("kind") == "leaf"]
     with branch.stage("reconstruct", settings, digests=digests | edits_digest(edits)) as stage:
-        meshed = mesh_skeleton(skeleton, settings, progress.keeping(warnings))
+        meshed = mesh_skeleton(skeleton, settings, branch.gravity,
+                               progress.keeping(warnings))
         write_branch(stage, labelled(cloud, skeleton),
                      replace(meshed, masses=[*meshed.masses, *leaves]))
         if edits:
