@@ -7,8 +7,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from benchmarks.worlds.sources import NEW, bare_case, sparse_case
-from limber.geometry.skeleton.likeliest_tree import fitted, likeliest_tree, rival_tree
+from limber.geometry.skeleton.likeliest_tree import State, fitted, grafted, pruned, rival_tree
 from limber.geometry.skeleton.likelihood_kernels import densities, falling
+from limber.geometry.skeleton.path_tree import path_tree
 from limber.geometry.skeleton.repair import PointSpacing
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -115,13 +116,11 @@ def test_a_thin_scan_shows_its_axes_and_hardly_changes_without_two_points():
     assert found[0].length == pytest.approx(found[1].length, rel=0.05)
 
 
-@pytest.mark.slow
 def test_a_twig_that_no_point_shows_is_left_out():
     seen = skin(0.004, 0.0005)
     nodes = np.vstack([rod().nodes, [[0.15, 0.0, 0.02], [0.15, 0.0, 0.05]]])
     first = Skeleton.from_edges(nodes, [*rod().parent, 10, 20], np.full(22, 0.004))
-    found, count, *_ = likeliest_tree([(first, PointLikelihood.of(seen))], PointSpacing.of(seen))
-    assert found.branch_count == count == 1
+    assert pruned(State.of(first, PointLikelihood.of(seen))).skeleton.branch_count == 1
 
 
 @pytest.mark.slow
@@ -131,9 +130,20 @@ def test_points_that_nothing_explains_become_a_twig(count, noise, is_sure):
     rng = np.random.default_rng(1)
     twig = np.column_stack([np.full(count, 0.15), np.zeros(count), rng.uniform(0.005, 0.08, count)])
     points = np.vstack([skin(0.004, 0.0005), twig + rng.normal(0, noise, twig.shape)])
-    found, _, _, spread = rival_tree(rod(), rod(), points)
+    found, _, _, spread = rival_tree(rod(), points)
     assert found.branch_count == 1 + is_sure and (spread < 0.09) is is_sure
     assert found.length == pytest.approx(0.38 if is_sure else 0.3, rel=0.05)
+
+
+def test_paths_lead_along_twigs_that_are_added():
+    """To the ends of two twigs side by side, 20 mm apart, from one stem."""
+    rng, across = np.random.default_rng(4), np.repeat([0.15, 0.17], 80)
+    twigs = np.column_stack([across, rng.uniform(0.005, 0.12, 160), 0 * across])
+    points = np.vstack([skin(0.003, 0.0005, 300), twigs + rng.normal(0, 0.001, (160, 3))])
+    paths = path_tree(points, np.zeros(3), PointSpacing.of(points))
+    for tree in (paths, grafted(State.of(rod(), PointLikelihood.of(points)), paths).skeleton):
+        ends = cKDTree(tree.nodes[tree.tips()])
+        assert ends.query([[0.15, 0.12, 0.0], [0.17, 0.12, 0.0]])[0].max() < 0.01
 
 
 @pytest.mark.slow

@@ -42,19 +42,18 @@ def _shell(low: float = 0.0, high: float = 0.4, radius: float = RADIUS,
     return on + noise * rng.standard_normal(on.shape)
 
 
-def _before(skeleton: Skeleton, points: np.ndarray | None = None, **found: object) -> Repaired:
+def _before(skeleton: Skeleton, points: np.ndarray | None = None, noise=NOISE) -> Repaired:
     """What a pass gets after a fit that all points lie on."""
     points = _shell() if points is None else points
-    nothing = np.empty((0, 3))
-    seen = seen_sides(nothing, nothing, *[np.ones(1)] * 2, np.ones(1), np.zeros(1))
-    fit = AxisFit(skeleton, np.zeros(len(points), int), np.zeros(len(points)), NOISE, seen)
-    return replace(Repaired(skeleton, points, (1e-4, 0.05), fit=fit), **found)
+    seen = seen_sides(*[np.empty((0, 3))] * 2, *[np.ones(1)] * 3, np.zeros(1))
+    fit = AxisFit(skeleton, np.zeros(len(points), int), np.zeros(len(points)), noise, seen)
+    return Repaired(skeleton, points, (1e-4, 0.05), fit=fit)
 
 
 def _apart() -> Repaired:
     tree, points = stations.merged(stations.SHIFTS, stations.EYES)
     fit = fit_axes(tree, points)
-    return _before(fit.skeleton, points, fit=fit)
+    return Repaired(fit.skeleton, points, (1e-4, 0.05), fit=fit)
 
 
 def _hair(part: slice, thin: float = 4e-4) -> Skeleton:
@@ -74,10 +73,6 @@ def _thick(now: Repaired) -> bool:
 
 def _centred(now: Repaired) -> bool:
     return float(np.linalg.norm(now.skeleton.nodes[5:-5, :2], axis=1).max()) < 0.0015
-
-
-def _one_run(now: Repaired) -> bool:
-    return now.skeleton.branch_count == 1
 
 
 def _aside(by: float = 0.004) -> Skeleton:
@@ -104,12 +99,10 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
                                             _twig(0.14, reach=0.018)]), at=39)),
             lambda now: abs(now.skeleton.nodes[now.skeleton.forks()[0], 2] - 0.14) < 0.011),
         "lengthen ends": lambda: (_before(_branch(ALONG[10:70])), _ends(0.0, 0.392)),
-        "drop duplicate axes": lambda: (_before(_branch(twig=ALONG[42:60] + [0.003, 0, 0])),
-                                        _one_run),
         "limit radii": lambda: (_before(_branch(radius=0.3)),
                                 lambda now: bool((now.skeleton.radius == 0.05).all())),
         "fit finely": lambda: (_before(_aside()), _centred),
-        "settle": lambda: (_before(_aside(), duplicates=1), _centred),
+        "settle": lambda: (_before(_aside(), noise=0.003), _centred),
         "draw ends back": lambda: (_before(_branch(np.vstack([
             [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]])), _shell(0.05, 0.4)),
             _ends(0.05, 0.4, 0.006)),
@@ -126,14 +119,12 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
 def test_each_pass_mends_its_own_case(each: Pass) -> None:
     """What is wrong before is right after."""
     before, mended = _of_pass(each.name)
-    assert not mended(before)
-    assert mended(each.run(before))
+    assert not mended(before) and mended(each.run(before))
 
 
 def test_passes_have_names_of_their_own() -> None:
     """A name stands for one pass, even where that runs several times; work only goes on."""
-    passes = list(dict.fromkeys(PASSES))
-    assert len({each.name for each in passes}) == len(passes)
+    assert len({each.name for each in PASSES}) == len(set(PASSES))
     until = [each.until for each in PASSES if each.until is not None]
     assert until == sorted(until) and until[-1] == 1.0
 

@@ -194,7 +194,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
             _searched(prepared, settings, own, supports, show, progress.part(0.02, 0.55))
             if known is None else _found_before(prepared, known, progress))
     whole = found
-    if wood.view is not None and own is None:
+    # The search of a thin scan has asked of each twig whether the sensor shows it.
+    if wood.view is not None and own is None and found.length_spread is None:
         found, text = seen_skeleton(found, wood)
         if text:
             progress.warn(text)

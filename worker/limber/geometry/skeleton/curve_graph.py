@@ -56,12 +56,12 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     links, spacing = neighbour_links(points)
     drawn = np.linalg.norm(points - contracted, axis=1)
     thickness = _smoothed(drawn, contracted)
-    owner = _cover(contracted, np.maximum(0.8 * thickness, 1.5 * spacing))
-    merged = specks(_means(owner, contracted), _node_links(owner, links),
-                    _means(owner, thickness[:, None])[:, 0], np.bincount(owner))
+    owner = cover(contracted, np.maximum(0.8 * thickness, 1.5 * spacing))
+    merged = specks(means(owner, contracted), _node_links(owner, links),
+                    means(owner, thickness[:, None])[:, 0], np.bincount(owner))
     _, owner = np.unique(merged[owner], return_inverse=True)
     support = np.bincount(owner)
-    nodes, radius = _means(owner, contracted), _means(owner, thickness[:, None])[:, 0]
+    nodes, radius = means(owner, contracted), means(owner, thickness[:, None])[:, 0]
     edges = _node_links(owner, links)
     length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     graph = CurveGraph(nodes, edges, radius, support)
@@ -111,7 +111,7 @@ def _smoothed(drawn: np.ndarray, contracted: np.ndarray) -> np.ndarray:
     return np.median(drawn[near], axis=1)
 
 
-def _cover(contracted: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def cover(contracted: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Greedy cover by balls of radius ``reach``; returns the node that owns each point."""
     tree = cKDTree(contracted)
     free = np.ones(len(contracted), bool)
@@ -127,7 +127,7 @@ def _cover(contracted: np.ndarray, reach: np.ndarray) -> np.ndarray:
     return owner
 
 
-def _means(owner: np.ndarray, points: np.ndarray) -> np.ndarray:
+def means(owner: np.ndarray, points: np.ndarray) -> np.ndarray:
     support = np.bincount(owner)
     return np.stack([np.bincount(owner, column) for column in points.T], axis=1) / support[:, None]
 

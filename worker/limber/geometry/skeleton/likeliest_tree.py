@@ -1,14 +1,13 @@
-"""The likeliest tree of a thin scan, from that of its contracted points, by proposals.
+"""The likeliest tree of a thin scan, by proposals.
 
 Where points are few and scatter as far as twigs are thick, no step can decide for itself what is
 wood. So each change is a proposal: leave out a twig, draw an end back, lengthen it, add a twig
-towards points that are badly explained. It is kept if the score rises
+towards points that are badly explained, or one of another search. It is kept if the score rises
 (:mod:`~limber.geometry.skeleton.tree_likelihood`). Between them axes and radii go to the largest
 posterior with the prior of wood: an expectation step asks where on the skin each point was, given
 the noise, and a maximisation step moves axes and radii to fit (Dempster, Laird, Rubin 1977).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 
@@ -22,6 +21,7 @@ from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.likelihood_kernels import densities, falling, left
+from limber.geometry.skeleton.path_tree import path_tree
 from limber.geometry.skeleton.radii.axis_fit import held_by_points
 from limber.geometry.skeleton.radii.fit_kernels import Match, cylinders_around, nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import by_projected_widths
@@ -40,6 +40,7 @@ _ALONG, _HELD = 0.3, 10.0  # radii that a step moves nodes along their axis, and
 _CHANGE = 0.5  # most that a step changes the logarithm of a radius
 _FIRM = 0.02  # least part of a point's weight with which it holds the axis across
 _TWIG = 0.4  # radius of a new twig over that of its carrier
+_PARTS = 4  # of a run of another search, from each of which on its end may be a twig
 _BADLY, _FEET, _TIPS = 400, 8, 2  # points explained worst; nodes and ends from which twigs may lead
 # Deviation of the logarithm of a tree's length, besides that between searches and by what twigs
 # cost (42 scans of the worlds).
@@ -54,17 +55,22 @@ _STEEP = 0.3  # least height of a front in radii by which that goes with the rad
 # its radius.
 _TABLE, _FACINGS, _LEVEL = 48, 9, 0.05
 
-def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View | None = None,
+def rival_tree(known: Skeleton, points: np.ndarray, view: View | None = None,
                progress: Progress = SILENT) -> tuple[Skeleton, float, int, float]:
-    """Return the likeliest tree found from the ``first``, that of the contracted points with all
-    its spurs, or from the ``known``, the noise [m], the number of twigs left out, and the standard
-    deviation of the logarithm of its length; ``points`` [m, 3] [m] are the scan's."""
+    """Return the likeliest tree found from the ``known``, from paths through the ``points`` [m, 3]
+    [m], or from the better of both with twigs of the other; the noise [m], the number of twigs
+    left out, and the standard deviation of the logarithm of its length."""
     apart = PointSpacing.of(points)
     # A beam wider than twigs shows them like thick axes; a thin one shows skins by their area.
     scan = max((replace(PointLikelihood.of(points), power=power) for power in (0.0, 0.5, 1.0)),
                key=lambda one: one.score(known))
-    skeleton, count, score, _ = likeliest_tree([(first, scan), (known, scan)], apart,
-                                               progress.part(0.0, 0.5))
+    searches = sorted((likeliest_tree(first, scan, apart, part) for first, part in (
+        (known, progress.part(0.0, 0.3)),
+        (path_tree(points, known.nodes[0], apart), progress.part(0.3, 0.6)))), key=itemgetter(2))
+    both = grafted(State.of(searches[1][0], scan), searches[0][0]).skeleton
+    if both is not searches[1][0]:
+        searches.append(likeliest_tree(both, scan, apart, progress.part(0.6, 0.7)))
+    skeleton, count, score, _ = max(searches, key=itemgetter(2))
     # Whether one sensor saw them is asked of whole searches: twigs that hang to one side of a
     # thick axis look so too, and a thin axis beside a branch's middle hides it.
     wide, seen, starts = skeleton, scan.where_seen(skeleton), []
@@ -73,7 +79,7 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
         wide = fitted(_spaced(wide, apart), seen, _STEPS)
         starts.append((wide, seen))
     starts.sort(key=lambda one: one[1].score(one[0]))
-    other, more, sighted, seen = likeliest_tree(starts[-1:], apart, progress.part(0.5, 1.0))
+    other, more, sighted, seen = likeliest_tree(*starts[-1], apart, progress.part(0.7, 1.0))
     if sighted > score + scan.twig_cost:  # it has numbers too
         scan, skeleton, other, count = seen, other, skeleton, count + more
     skeleton = fitted(_spaced(skeleton, apart), scan, _LAST_STEPS)
@@ -92,27 +98,23 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
         [_APART, unknown / 2, np.log(other.length / skeleton.length) / 2]))
 
 
-def likeliest_tree(starts: Sequence[tuple[Skeleton, PointLikelihood]], apart: PointSpacing,
+def likeliest_tree(skeleton: Skeleton, scan: PointLikelihood, apart: PointSpacing,
                    progress: Progress = SILENT) -> tuple[Skeleton, int, float, PointLikelihood]:
-    """The likeliest tree found from that of the ``starts`` which scores most after a first pass,
-    the number of twigs left out, the score, and the scan as its sensor then sees it."""
-    count, found = 0, (-np.inf, *starts[0])
+    """The likeliest tree found from a first one, the number of twigs left out, the score, and the
+    scan as its sensor then sees it."""
+    count, found = 0, (-np.inf, skeleton, scan)
     for number in range(_PASSES):
         progress(number / _PASSES, "comparing trees")
-        tried = []
-        for skeleton, scan in starts:
-            skeleton = fitted(_spaced(skeleton, apart), scan, _STEPS)
-            rest = drawn_back(pruned(State.of(skeleton, scan.turned(skeleton))))
-            tried.append((rest.scan.score(rest.skeleton), rest,
-                          skeleton.branch_count - rest.skeleton.branch_count))
-        score, rest, fewer = max(tried, key=itemgetter(0))
-        count += fewer
+        skeleton = fitted(_spaced(skeleton, apart), scan, _STEPS)
+        rest = drawn_back(pruned(State.of(skeleton, scan.turned(skeleton))))
+        count += skeleton.branch_count - rest.skeleton.branch_count
+        score = rest.scan.score(rest.skeleton)
         if score > found[0]:
             found = score, rest.skeleton, rest.scan
         after = grown(rest, apart)
         if after is rest:
             break
-        starts = [(after.skeleton, after.scan)]
+        skeleton, scan = after.skeleton, after.scan
     return found[1], count, found[0], found[2]
 
 
@@ -355,6 +357,25 @@ def grown(state: State, apart: PointSpacing) -> State:
         if after.log <= state.log:
             return state
         state = after
+
+
+def grafted(state: State, other: Skeleton) -> State:
+    """Add runs of another tree, or only their ends, where the score rises."""
+    for run in range(other.branch_count):
+        nodes, radius = other.curve(run)
+        firsts = np.unique(np.arange(_PARTS) * (len(nodes) - 1) // _PARTS) + 1
+        state = max([state, *(State.of(_hung(state.skeleton, nodes[first:], radius[first:]),
+                                       state.scan, state.scatter) for first in firsts)],
+                    key=lambda one: one.log)
+    return state
+
+
+def _hung(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray) -> Skeleton:
+    """The skeleton with a chain of nodes [k, 3] [m] with radii [m] that hangs on its nearest."""
+    foot, made = cKDTree(skeleton.nodes).query(nodes[0])[1], skeleton.node_count
+    parent = np.concatenate([skeleton.parent, [foot], made + np.arange(len(nodes) - 1)])
+    return Skeleton.from_edges(np.vstack([skeleton.nodes, nodes]), parent,
+                               np.append(skeleton.radius, radius))
 
 
 @dataclass(frozen=True)

@@ -107,42 +107,6 @@ def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.
     return int(carrier[np.argmin(np.where(allowed, across, np.inf))])
 
 
-# Two parallel axes in one branch, which the contraction leaves where a scan has holes.
-
-
-def without_duplicate_axes(skeleton: Skeleton) -> tuple[Skeleton, int]:
-    """Drop side runs that lie mostly inside others, thinnest first; also return their number."""
-    count, run = 0, skeleton.branch_count - 1
-    while run > 0:
-        if _is_duplicate(skeleton, run):
-            skeleton, count = skeleton.subset(skeleton.branch != run), count + 1
-            run = skeleton.branch_count
-        run -= 1
-    return skeleton, count
-
-
-def _is_duplicate(skeleton: Skeleton, run: int) -> bool:
-    """Whether a side run has no twigs of its own and is mostly inside the others."""
-    own = np.flatnonzero(skeleton.branch == run)
-    carried = (skeleton.branch[skeleton.parent[1:]] == run) & (skeleton.branch[1:] != run)
-    if carried.any():
-        return False
-    # Other runs that could contain it: only those nearby.
-    middle = skeleton.nodes[own].mean(axis=0)
-    span = np.linalg.norm(skeleton.nodes[own] - middle, axis=1).max()
-    reach = 2 * span + 1.4 * float(skeleton.radius.max())
-    others = np.flatnonzero((skeleton.branch != run)
-                            & (np.linalg.norm(skeleton.nodes - middle, axis=1) < reach))
-    if len(others) == 0:
-        return False
-    gap = np.linalg.norm(skeleton.nodes[own][:, None] - skeleton.nodes[others], axis=2)
-    near = np.argmin(gap, axis=1)
-    # A duplicate may be the thicker one of the two.
-    thick = np.maximum(skeleton.radius[others][near], skeleton.radius[own])
-    share = gap[np.arange(len(own)), near] / thick
-    return float(np.median(share)) < 1.3
-
-
 # Kinks within a branch that wood does not make.
 
 _END = 8.0  # radii from a kink to the tip below which the rest is a folded end
@@ -303,7 +267,7 @@ class PointSpacing:
 
 _COARSE = 1.5  # local radii between the nodes of the first fit
 _NOISY = 0.2  # fraction of the median radius
-_ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # rounds of the last fit
+_SETTLED = 18  # rounds of the last fit
 
 
 @dataclass(frozen=True)
@@ -316,9 +280,6 @@ class Repaired:
         view: The depth camera's view of the points, if they are one's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
-        duplicates: Number of duplicate axes that the last search dropped.
-        pruned: Number of twigs dropped.
-        apart: How far apart the points are; None: not known yet.
         common: Deviation of what all radii are off together by the stations' registration [m].
     """
 
@@ -328,10 +289,7 @@ class Repaired:
     view: View | None = None
     rays: bool = False
     fit: AxisFit | None = None
-    duplicates: int = 0
-    pruned: int = 0
     progress: Progress = SILENT
-    apart: PointSpacing | None = None
     common: float = 0.0
 
     def of(self, skeleton: Skeleton) -> "Repaired":
@@ -348,8 +306,7 @@ class Repaired:
 
     def sampled(self, skeleton: Skeleton, spacing: float = 1.0) -> Skeleton:
         """A skeleton with nodes ``spacing`` local radii apart, where there are points for each."""
-        apart = self.apart or PointSpacing.of(self.points)
-        return resampled(skeleton, spacing, apart.at(skeleton.nodes))
+        return resampled(skeleton, spacing, PointSpacing.of(self.points).at(skeleton.nodes))
 
     @property
     def noise(self) -> float:
@@ -380,17 +337,10 @@ def _fit_coarsely(now: Repaired) -> Repaired:
         after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
 
 
-def _drop_duplicate_axes(now: Repaired) -> Repaired:
-    skeleton, count = without_duplicate_axes(now.skeleton)
-    return replace(now, skeleton=skeleton, duplicates=count, pruned=now.pruned + count)
-
-
 def _settle(now: Repaired) -> Repaired:
     # Noise leaves little information per round.
     noisy = now.noise > _NOISY * float(np.median(now.skeleton.radius))
-    rounds = _ROUNDS_NOISY if noisy else _ROUNDS_LATE if now.duplicates else 0
-    return now.fitted(now.skeleton, rounds=rounds, settled=noisy and not now.duplicates,
-                      seen=now.last_fit.seen)
+    return now.fitted(now.skeleton, rounds=_SETTLED * noisy, settled=noisy, seen=now.last_fit.seen)
 
 
 def _register_stations(now: Repaired) -> Repaired:
@@ -410,8 +360,6 @@ def _mend_kinks(now: Repaired) -> Repaired:
 
 # Where points are missing, a first radius is far too small.
 STEADY = Pass("steady radii", lambda now: now.of(steadied(now.skeleton, now.points)))
-# Where a scan has holes, one branch has two parallel axes.
-DROP_DUPLICATE_AXES = Pass("drop duplicate axes", _drop_duplicate_axes)
 # A radius is outside the range for a cloud of this size.
 LIMIT = Pass("limit radii", lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
 
@@ -424,14 +372,12 @@ PASSES = (
     # The contraction shortens an end.
     Pass("lengthen ends",
          lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
-    DROP_DUPLICATE_AXES,
     STEADY,
     LIMIT,
     # Axes and radii come from too few nodes, and from forks that have moved since.
     Pass("fit finely", lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False),
          until=0.8),
-    DROP_DUPLICATE_AXES,
-    # Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.
+    # Noise leaves the fit unfinished.
     Pass("settle", _settle, until=0.9),
     # The stations of a merged scan are a little apart, so that all radii are off together.
     Pass("register stations", _register_stations, until=1.0),
@@ -454,7 +400,7 @@ def repaired(skeleton: Skeleton, points: np.ndarray, radius_limits: tuple[float,
              view: View | None, progress: Progress = SILENT) -> Repaired:
     """Run all passes on the skeleton, with first radii, of the contracted points. ``points``
     [m, 3] [m] are the scan, thinned; ``view`` is the depth camera's, if they are one's."""
-    now = Repaired(skeleton, points, radius_limits, view, apart=PointSpacing.of(points))
+    now = Repaired(skeleton, points, radius_limits, view)
     done = 0.0
     for each in PASSES:
         until = done if each.until is None else each.until

@@ -101,15 +101,11 @@ class _Search:
 
     def pruned(self, graph: CurveGraph, start: int) -> tuple[Skeleton, int]:
         """A skeleton with first radii and without spurs, and the number of dropped spurs."""
-        first = self.unpruned(graph, start)
+        least = 1e-3 * float(np.median(graph.thickness)) + 1e-12
+        first = Skeleton.from_edges(graph.nodes, rooted(graph.nodes, graph.edges, start),
+                                    np.maximum(graph.thickness, least))
         keep, count = prune_spurs(first.nodes, first.parent, first.radius, SPUR_REACH)
         return first.subset(keep), count
-
-    def unpruned(self, graph: CurveGraph, start: int) -> Skeleton:
-        """A skeleton with first radii and all spurs."""
-        least = 1e-3 * float(np.median(graph.thickness)) + 1e-12
-        return Skeleton.from_edges(graph.nodes, rooted(graph.nodes, graph.edges, start),
-                                   np.maximum(graph.thickness, least))
 
     def to_fit(self, graph: CurveGraph, thin: np.ndarray) -> np.ndarray:
         """Points for the fit [m]: points that the graph discarded must not attract the rest."""
@@ -179,10 +175,9 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     fitted = repaired(first, some, settings.radius_limits(search.diagonal), view,
                       progress.part(0.65, 0.95))
     wood, (skeleton, unlikely) = fitted.skeleton, likely(fitted.skeleton, twig_probability)
-    noise, count, spread = fitted.noise, pruned + fitted.pruned, None
+    noise, count, spread = fitted.noise, pruned, None
     if len(points) <= _SEARCHED:
-        wood, noise, count, spread = rival_tree(search.unpruned(graph, start), skeleton, some, view,
-                                                progress.part(0.95, 1.0))
+        wood, noise, count, spread = rival_tree(skeleton, some, view, progress.part(0.95, 1.0))
         skeleton, unlikely = wood, []
     segment, residual = nearest_cylinders(wood, points)
     check_round(wood, points, segment, residual)
