@@ -21,7 +21,7 @@ from limber.estimation.forward.forward_model import (
     under_its_weight,
 )
 from limber.estimation.forward.observed_path import ObservedPathForward
-from limber.estimation.forward.solved_pull import QuasiStaticForward, uses_torque
+from limber.estimation.forward.solved_pull import Lumping, QuasiStaticForward, uses_torque
 from limber.estimation.parameters import (
     BULK,
     ParameterSpace,
@@ -37,7 +37,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig, PointMass
 from limber.mechanics.loads.loaded_branch import is_stable
 from limber.mechanics.materials.materials import LayeredSection, RayleighDamping, young_weights
-from limber.mechanics.model import BranchModel, CarriedWeight
+from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.recordings.recording import CalibrationEntry, Pull, PullEntry, calibration_of, grasp_on
 from limber.recordings.synchronisation import Frames, frames_of
@@ -69,7 +69,7 @@ class Subject:
     model: BranchModel
     start: Values
     field: YoungField | None = None
-    lumping: "Lumping | None" = None
+    lumping: Lumping | None = None
 
     def young(self, values: Values) -> np.ndarray:
         """Young's modulus of the tetrahedra [Pa], shape [tet_count]."""
@@ -105,16 +105,6 @@ LUMPED_ERROR = 5e-3
 """Change of the response to the gripper's forces, relative to it, above which nothing is lumped."""
 
 
-@dataclass(frozen=True)
-class Lumping:
-    """Twigs that are not meshed: the largest relative change by that of the linear response of
-    grasps and points to the grippers' forces, and how the mesh's shape carries their weight (None:
-    weightless)."""
-
-    error: float
-    weight: CarriedWeight | None
-
-
 def lumped(whole: Subject, pulls: list[Pull], settings: FitSpec) -> Subject:
     """Return the branch with rigid twigs where no pull's gripper and no observed point is, if the
     pulls cannot tell the difference."""
@@ -131,14 +121,13 @@ def lumped(whole: Subject, pulls: list[Pull], settings: FitSpec) -> Subject:
     weights, field, model = whole.weights[kept], whole.field, whole.model
     if field is not None:
         field = field.on(kept)
-    weight: CarriedWeight | None = None
+    weight, twigs = None, _twigs(whole, twig)
     bare = BranchModel(mesh, young=MODEL_YOUNG_PA, poisson=whole.start.poisson,
                        density=whole.start.density, gravity=tuple(model.gravity),
                        point_masses=model.point_masses)
     if model.prestress is not None:
         bare = bare.as_scanned()
-        hung = bare.without_point_masses().with_point_masses(
-            _twigs(whole, twig)).as_scanned()
+        hung = bare.without_point_masses().with_point_masses(twigs).as_scanned()
         weight = present(present(hung.prestress, "prestress").added, "weight of twigs")
         known = present(bare.prestress, "prestress")
         bare.prestress = replace(known, own=known.own + weight)
@@ -147,7 +136,7 @@ def lumped(whole: Subject, pulls: list[Pull], settings: FitSpec) -> Subject:
     if error > LUMPED_ERROR:
         return whole
     return replace(whole, mesh=mesh, weights=weights, field=field, model=bare,
-                   lumping=Lumping(error, weight))
+                   lumping=Lumping(error, weight, twigs))
 
 
 def _reached(mesh: TetMesh, skeleton: Skeleton, points: np.ndarray,
@@ -323,8 +312,8 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
             rest = rest + moved[:, None] * PointDirections.at(subject.mesh, rest).rest
         forward = _forward(pull.name, entry, frames, rest, subject, settings)
         forward.skeleton = subject.skeleton
-        if isinstance(forward, QuasiStaticForward) and subject.lumping is not None:
-            forward.lumped_weight = subject.lumping.weight
+        if isinstance(forward, QuasiStaticForward):
+            forward.lumping = subject.lumping
         if moved is not None:
             forward.point_shifts = moved
         forwards.append(forward)

@@ -176,11 +176,10 @@ class _Strategy:
         """The fit with points where the branch shows that they are, if that is far from where they
         are stated: an error along a bent branch is not linear."""
         forwards = forwards_of(self.pulls, self.subject, self.settings)
-        start, near, shifts, known = None, self.near, {}, self.known
+        near, shifts, known = self.near, {}, self.known
         beams = [] if any(forward.is_dynamic for forward in forwards) else starts.beams_of(forwards)
         if beams:
             begun = starts.beam_start(beams, self.subject.start)
-            start = None if begun.is_immobile else begun.values
             if begun.explained < starts.EXPLAINED:
                 self.progress.warn(starts.unexplained(begun))
             shifts = starts.far_from_stated(beams, begun)
@@ -200,7 +199,7 @@ class _Strategy:
                 progress=self.progress,
                 expected_count=20 if self.settings.method == "gauss-newton" else 200)
             found = fit_pulls(objective, self.subject.start, self.settings, self.progress,
-                              near=near, scaled=start, quick=True)
+                              near=near, quick=True)
             far = starts.far_points(found.cell_errors, shifts)
             if far is None or found.stopped or not rounds_left:
                 return found
@@ -222,16 +221,16 @@ def _begin_at(forwards: Sequence[Forward], known: Sequence[Forward]) -> None:
 
 def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
               progress: Progress = SILENT, *, near: Values | None = None,
-              scaled: Values | None = None, quick: bool = False) -> Estimate:
+              quick: bool = False) -> Estimate:
     """Check what the data determine, fit, and compute intervals; ``quick`` keeps Gauss' and judges
     nothing (:func:`complete`). It starts from ``near`` if that has an equilibrium, otherwise from
-    ``scaled``, moduli of the right size (None: found here)."""
+    moduli of the right size."""
     require_scale_in_principle(objective.forwards)
     first = None if near is None else objective.evaluate(objective.space.pack(near),
                                                          jacobian=True)
     is_near = near is not None and first is not None
     if first is None:
-        near, first = _standing(objective, start, scaled, progress)
+        near, first = _standing(objective, start, progress)
     start = present(near, "initial values")
     judged = identify.identifiability(first, objective.space)
     if not identify.force_is_measured(objective):
@@ -272,20 +271,22 @@ def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) ->
         hold_out(found, progress)
 
 
-def _standing(objective: Objective, start: Values, scaled: Values | None, progress: Progress,
+def _standing(objective: Objective, start: Values, progress: Progress,
               ) -> tuple[Values, Evaluation]:
     """Return initial values that have equilibria, and their evaluation."""
-    start = starts.scaled_start(objective, start) if scaled is None else starts.standing(
-        objective, scaled)
+    start = starts.scaled_start(objective, start)
     if any(forward.uses_force for forward in objective.forwards):
         suspicion = force_unit_suspicion(float(np.exp(np.mean(np.log(start.young)))))
         if suspicion:
             progress.warn(suspicion)
-    found = starts.standing_start(objective, start)
-    if found is None:
+    first = objective.evaluate(objective.space.pack(start), jacobian=True)
+    if first is None:
+        start = starts.scanned(objective, start)
+        first = objective.evaluate(objective.space.pack(start), jacobian=True)
+    if first is None:
         raise _without_equilibrium(objective)
-    _require_stable(objective, found[0])
-    return found
+    _require_stable(objective, start)
+    return start, first
 
 
 def _require_stable(objective: Objective, values: Values) -> None:

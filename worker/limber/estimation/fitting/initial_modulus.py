@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import WorkError
 from limber.core.not_none import present
-from limber.core.numerics.rigid import rotated
-from limber.estimation.fitting.objective import Evaluation, Objective, seen_in
-from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
+from limber.core.numerics.rigid import rotated, rotation_matrix
+from limber.estimation.fitting.objective import Objective, seen_in
+from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import Forward, key_frames, smoothed, travel
 from limber.estimation.forward.observed_path import AT_REST_M
 from limber.estimation.forward.solved_pull import QuasiStaticForward
@@ -26,12 +26,12 @@ from limber.recordings.recording import Pull, calibration_of
 # The run from base to grasp is a rod of round sections. Force and place of the gripper are
 # recorded, so the moment in each section is known as soon as its place is, and the deformed rod
 # follows from the base outwards, section by section, for any modulus: no equations are solved, and
-# no modulus is without a state. What grows on the run is rigid and weighs on it.
+# no modulus is without a state. What grows on the run is rigid and weighs on it, where the points
+# were seen: a soft branch's own answer to its weight is another for each modulus, and far off for
+# a wrong one.
 
 SECTIONS, KEYS = 48, 12
 """Sections of the rod, and frames of a pull that are compared."""
-WEIGHT_PASSES = 3
-"""Times that the rod is bent by the weight of its last shape; the first has none."""
 BEAM_M, BEAM_SHARE = 3e-3, 0.03
 """Deviation of the beam's points: constant [m], and a fraction of the longest motion. Chosen."""
 DECADES = np.arange(3.0, 12.01, 0.25)
@@ -47,8 +47,6 @@ FEWEST_FRAMES = 6
 """Fewest frames that describe a motion."""
 STIFFER = 2.0
 """Factor by which a branch that does not carry its own weight is stiffened at a time."""
-MOST_STIFFENED = 6
-"""Times that a start without equilibrium is stiffened, threefold each."""
 MOST_DECADES = 6.0
 """Farthest search for the scale of the moduli where no force gives it."""
 
@@ -60,8 +58,9 @@ class Beam:
 
     def __init__(self, forward: QuasiStaticForward):
         self._forward, mesh = forward, forward.mesh
-        self.name = forward.name
+        self.name, self.may_be_off_along = forward.name, forward.may_be_off_along
         self._gravity = forward.model.gravity
+        self._is_prestressed = forward.model.prestress is not None
         skeleton = present(forward.skeleton, "skeleton of a pulled branch")
         grasp = np.array(forward.entry.grasp.point_m)
         run = _run_to(skeleton, grasp)
@@ -82,13 +81,17 @@ class Beam:
         self.rest = np.vstack([forward.rest_points, grasp])
         self._at = np.r_[section[tree.query(forward.rest_points)[1]], SECTIONS].astype(int)
         added = forward.model.point_masses
-        places = np.vstack([mesh.centroids, *(np.reshape(each.position, (1, 3)) for each in added)])
-        at = section[tree.query(places)[1]]
+        twigs = forward.lumping.twigs if forward.lumping is not None else ()
+        centres = np.vstack([mesh.centroids, *(each.position for each in (*twigs, *added))])
+        at = section[tree.query(centres)[1]]
+        # Of wood its volume, of what was added its mass.
+        density = float(np.mean(forward.model.density))
+        amounts = np.r_[np.abs(mesh.volumes), [each.mass / density for each in twigs],
+                        [each.mass for each in added]]
+        is_added = (np.arange(len(at)) >= len(at) - len(added)).astype(int)
         self._carried = np.zeros((2, SECTIONS + 1, 4))
-        for part, mass in enumerate((np.abs(mesh.volumes), np.array([e.mass for e in added]))):
-            chosen = slice(0, mesh.tet_count) if part == 0 else slice(mesh.tet_count, None)
-            np.add.at(self._carried[part], at[chosen], mass[:, None] * np.column_stack(
-                [np.ones(len(mass)), (places - self.axis[at])[chosen]]))
+        np.add.at(self._carried, (is_added, at), amounts[:, None] * np.column_stack(
+            [np.ones(len(at)), centres - self.axis[at]]))
         self._record(forward, grasp)
 
     def _record(self, forward: QuasiStaticForward, grasp: np.ndarray) -> None:
@@ -117,9 +120,34 @@ class Beam:
         self.torque = wrench[:, 3:] if wrench.shape[1] == 6 else np.zeros_like(self.force)
         points = frames.positions.reshape(len(frames), -1)
         self.seen = np.concatenate([np.reshape([at_keys(each) for each in points.T], (
-            -1, len(keys))).T.reshape(len(keys), -1, 3), self.place[:, None]], axis=1)
+            -1, len(keys))).T.reshape(len(keys), -1, 3), np.where(
+                self.is_loaded, np.nan, self.place)[:, None]], axis=1)
+        self._motion = self.seen - (self.rest if self.is_loaded else self.seen[0])
+        self._places, self._turns = self._recorded()
         if self.is_loaded:
-            self.seen[:, -1] = np.nan
+            self.place = self._places[:, -1] + self.rest[-1] - self.axis[-1]
+
+    def _recorded(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places [k, S + 1, 3] and rotations [k, S + 1, 3, 3] of the sections between the points
+        that were seen, without twist."""
+        seen = np.isfinite(self._motion).all(axis=(0, 2)) & (self._at > 0)
+        at, first = np.unique(self._at[seen], return_index=True)
+        moved = np.zeros((len(self.force), SECTIONS + 1, 3))
+        if len(at):
+            through = scipy.interpolate.CubicSpline(
+                np.r_[0, at], np.insert(self._motion[:, seen][:, first], 0, 0.0, axis=1), axis=1,
+                bc_type=("clamped", "natural"))
+            # Beyond the last one it is straight.
+            beyond = np.maximum(np.arange(SECTIONS + 1) - at[-1], 0)[:, None]
+            moved = through(np.minimum(np.arange(SECTIONS + 1), at[-1])) + (
+                beyond * through(at[-1], 1)[:, None])
+        places = self.axis + moved
+        before, after = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (
+            np.gradient(self.axis, axis=0), np.gradient(places, axis=1)))
+        sine = np.cross(before, after)
+        angle = np.arctan2(np.linalg.norm(sine, axis=-1), (before * after).sum(axis=-1))
+        vectors = sine / np.sinc(angle / np.pi)[..., None]
+        return places, rotation_matrix(vectors.reshape(-1, 3)).reshape(*places.shape, 3)
 
     def bent(self, values: Sequence[Values], zeros: np.ndarray | float = 0.0,
              ) -> tuple[np.ndarray, np.ndarray]:
@@ -129,22 +157,15 @@ class Beam:
         stiffness = young * self._second, young * self._second / (1 + values[0].poisson)
         gravity = self._gravity
         carried = values[0].density * self._carried[0] + self._carried[1]
-        places, turns = self.axis[None, None], np.broadcast_to(
-            np.eye(3), (1, 1, SECTIONS + 1, 3, 3))
-        hung = self._hung(carried, places, turns, gravity)
-        held = hung[0, 0] if self._forward.model.prestress is not None else 0 * hung[0, 0]
-        force = np.broadcast_to(self.force - zeros, (len(values), *self.force.shape))
-        weight = _from_end(carried[:, :1] * gravity)
-        for _ in range(WEIGHT_PASSES if gravity.any() or self.is_loaded else 1):
-            hung = self._hung(carried, places, turns, gravity)
-            grasp = places[:, :, -1] + self.rest[-1] - self.axis[-1] if self.is_loaded else (
-                self.place)
-            shape = (len(values), len(self.force))
-            places, turns = np.empty((*shape, SECTIONS + 1, 3)), np.empty(
-                (*shape, SECTIONS + 1, 3, 3))
-            _bend_rods.of(
-                self.axis, *stiffness, force, self.torque, np.broadcast_to(grasp, (*shape, 3)),
-                weight, np.broadcast_to(hung, (*shape, SECTIONS + 1, 3)), held, places, turns)
+        held = self._hung(carried, self.axis, np.eye(3), gravity) * self._is_prestressed
+        shape = (len(values), len(self.force), SECTIONS + 1, 3)
+        places, turns = np.empty(shape), np.empty((*shape, 3))
+        _bend_rods.of(
+            self.axis, *stiffness, np.broadcast_to(self.force - zeros, (*shape[:2], 3)),
+            self.torque, np.broadcast_to(self.place, (*shape[:2], 3)),
+            _from_end(carried[:, :1] * gravity), np.broadcast_to(
+                self._hung(carried, self._places, self._turns, gravity), shape),
+            held, places, turns)
         found = turns[:, :, self._at]
         return places[:, :, self._at] + np.einsum(
             "bkmij,mj->bkmi", found, self.rest - self.axis[self._at]), found
@@ -152,24 +173,18 @@ class Beam:
     @staticmethod
     def _hung(carried: np.ndarray, places: np.ndarray, turns: np.ndarray, gravity: np.ndarray,
               ) -> np.ndarray:
-        """Moment of the weight from each section on about the origin, [b, k, S + 1, 3]."""
-        return _from_end(np.cross(carried[:, :1] * places + np.einsum(
-            "bksij,sj->bksi", turns, carried[:, 1:]), gravity))
+        """Moment of the weight from each section on about the origin, [..., S + 1, 3]."""
+        arms = (turns @ carried[:, 1:, None])[..., 0]
+        return _from_end(np.cross(carried[:, :1] * places + arms, gravity))
 
     def residuals(self, values: Sequence[Values], zeros: np.ndarray) -> np.ndarray:
         """Difference of simulated and recorded motions over their deviation, [b, r]: from the
         first frame on, as places at rest may be wrong; under a stated load, from rest. ``zeros``
         [b, 3]: of the force, over their deviation."""
         moved, _ = self.bent(values, self.zero_sigma * zeros[:, None])
-        seen = self.seen - (self.rest if self.is_loaded else self.seen[0])
-        off = moved - (self.rest if self.is_loaded else moved[:, :1]) - seen
-        size = float(np.nanmax(np.linalg.norm(seen, axis=-1), initial=0.0))
+        off = moved - (self.rest if self.is_loaded else moved[:, :1]) - self._motion
+        size = float(np.nanmax(np.linalg.norm(self._motion, axis=-1), initial=0.0))
         return np.nan_to_num(off / (BEAM_M + BEAM_SHARE * size)).reshape(len(values), -1)
-
-    @property
-    def may_be_off(self) -> bool:
-        """Whether observed points may be elsewhere along the branch than stated."""
-        return self._forward.may_be_off_along and not self.is_loaded
 
     def shifts(self, begun: "BeamStart") -> np.ndarray:
         """Distances of the observed points along the branch from where they are stated [m], [m]."""
@@ -216,11 +231,6 @@ class BeamStart:
     explained: float
     zeros: Mapping[str, np.ndarray]
 
-    @property
-    def is_immobile(self) -> bool:
-        """Whether the stiffest rod is the best: then it is no modulus that was found."""
-        return bool(self.values.young.max() >= 0.9 * YOUNG_BOUNDS_PA[1])
-
 
 EXPLAINED = 0.5
 """Part of the recorded motion that some modulus has to explain. Chosen: sound pulls reach 0.9."""
@@ -241,7 +251,8 @@ def beams_of(forwards: Sequence[Forward]) -> list[Beam]:
 
 def far_from_stated(beams: Sequence[Beam], begun: BeamStart) -> dict[str, np.ndarray]:
     """Distances of pulls' points along the branch [m], by name, where one is far."""
-    found = {beam.name: beam.shifts(begun) for beam in beams if beam.may_be_off}
+    found = {beam.name: beam.shifts(begun) for beam in beams
+             if beam.may_be_off_along and not beam.is_loaded}
     return {name: each for name, each in found.items() if np.abs(each).max(initial=0) > FAR_M}
 
 
@@ -295,30 +306,17 @@ def scaled_start(objective: Objective, values: Values) -> Values:
         return _step_by_step(objective, values)
     beams = beams_of(objective.forwards)
     begun = beam_start(beams, values) if beams else None
-    if begun is None or begun.is_immobile:
-        return _scanned(objective, standing(objective, values))
+    if begun is None or begun.values.young.max() >= 0.9 * YOUNG_BOUNDS_PA[1]:
+        return scanned(objective, standing(objective, values))
     return standing(objective, begun.values)
 
 
 def standing(objective: Objective, values: Values) -> Values:
     """Return the values with all moduli so much stiffer that the branch carries its own weight."""
-    while not all(forward.stands(values) for forward in objective.forwards):
-        if values.young.max() >= YOUNG_BOUNDS_PA[1]:
-            break
+    while values.young.max() < YOUNG_BOUNDS_PA[1] and not all(
+            forward.stands(values) for forward in objective.forwards):
         values = replace(values, young=np.clip(STIFFER * values.young, *YOUNG_BOUNDS_PA))
     return values
-
-
-def standing_start(objective: Objective, start: Values) -> tuple[Values, Evaluation] | None:
-    """Return the start, or the first of stiffer ones that has an equilibrium, and its evaluation.
-    None if none has."""
-    for number in range(MOST_STIFFENED + 1):
-        values = replace(start, young=np.clip(
-            start.young * np.exp(number * LONGEST_STEP), *YOUNG_BOUNDS_PA))
-        found = objective.evaluate(objective.space.pack(values), jacobian=True)
-        if found is not None:
-            return values, found
-    return None
 
 
 def _step_by_step(objective: Objective, values: Values) -> Values:
@@ -332,7 +330,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
                     for forward in objective.forwards]
         short = objective.with_space(likely, forwards)
         if number == 0:
-            values = _scanned(short, standing(short, values))
+            values = scanned(short, standing(short, values))
         fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2,
                            force_rounds=1)
         values = likely.unpack(fit.evaluation.free)
@@ -340,7 +338,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
     return values
 
 
-def _scanned(objective: Objective, values: Values) -> Values:
+def scanned(objective: Objective, values: Values) -> Values:
     """Descend over decades, then halve the step: the objective has one valley along the scale.
     Moduli without equilibrium are too soft: the search begins at the first with one."""
     tried: dict[float, float | None] = {}

@@ -74,19 +74,15 @@ class Fit:
         return self.status is FitStatus.converged
 
 
-def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
+def gauss_newton(objective: Objective, start: np.ndarray, *,
                  evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
                  force_rounds: int = FORCE_ROUNDS, shortest: float = SETTLED_STEP) -> Fit:
-    """Levenberg-Marquardt within bounds, at most threefold in a modulus a step. ``robust``:
+    """Levenberg-Marquardt within bounds, at most threefold in a modulus a step. In the end
     residuals beyond ``OUTLYING`` count linearly (soft l1). It ends at a relative change
     ``tolerance`` of the cost or a step ``shortest`` in deviations. WorkError if the start has no
     equilibrium."""
     # Far from the solution all residuals are large, and a robust loss would only slow convergence.
-    phases = [(False, ROUGH_ENDING), (True, tolerance)]
-    if not robust:
-        phases = [(False, tolerance)]
-    elif is_near:
-        phases = phases[1:]
+    phases = [(False, ROUGH_ENDING), (True, tolerance)][is_near:]
     search = _Search(objective, evaluation_limit, shortest)
     at = _required(objective, search.inside(start))
     for phase in phases:

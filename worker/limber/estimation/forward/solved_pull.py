@@ -2,6 +2,7 @@
 with exact derivatives."""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from limber.estimation.forward.forward_model import (
 )
 from limber.estimation.parameters import Values, YoungField, equal_values, mechanics_names
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.added_masses import HungTwig
 from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.grasp import Grasp
@@ -96,13 +98,24 @@ class _Memory:
         return self.result.displacement
 
 
+@dataclass(frozen=True)
+class Lumping:
+    """Twigs that are not meshed: the largest relative change by that of the linear response of
+    grasps and points to the grippers' forces, how the mesh's shape carries their weight (None:
+    weightless), and the twigs."""
+
+    error: float
+    weight: CarriedWeight | None
+    twigs: Sequence[HungTwig]
+
+
 class QuasiStaticForward(Forward):
     """Simulates one pull in equilibrium, at most at ``key_count`` frames. Their states are kept:
     parameters change little, so two Newton steps are enough. ``weights`` [tet_count, K] map moduli
     to tetrahedra, unless ``field`` does."""
 
-    lumped_weight: CarriedWeight | None = None
-    """How the mesh's shape carries twigs that are not meshed."""
+    lumping: Lumping | None = None
+    """What is not in the mesh. None: nothing."""
 
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
                  frames: Frames, rest_points: np.ndarray, *, key_count: int = 12,
@@ -277,10 +290,10 @@ class QuasiStaticForward(Forward):
         model = self._model.with_rest_nodes(nodes)
         if self._model.prestress is not None:
             model = model.as_scanned()
-            if self.lumped_weight is not None:
+            if self.lumping is not None and self.lumping.weight is not None:
                 # Its change with the shape is left out: a part of a small part.
                 known = present(model.prestress, "prestress")
-                model.prestress = replace(known, own=known.own + self.lumped_weight)
+                model.prestress = replace(known, own=known.own + self.lumping.weight)
         other._model = model
         other.grasp = self.grasp.elsewhere(other.mesh, np.array(self.entry.grasp.point_m))
         if self.drive == "pose":
@@ -314,7 +327,7 @@ class QuasiStaticForward(Forward):
         made = type(self)(self.name, self._model, self.weights, self.entry,
                           replace(self.frames, poses=poses), self.rest_points,
                           key_count=FEW_KEYS, field=self.field)
-        made.lumped_weight, made.creep_time = self.lumped_weight, self.creep_time
+        made.lumping, made.creep_time = self.lumping, self.creep_time
         made.begin_at(self)
         return made
 

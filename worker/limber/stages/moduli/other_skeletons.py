@@ -8,7 +8,7 @@ pulls are fitted on each of them again, and their likelihood counts beside the s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,7 +109,7 @@ def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull
     if found.is_weightless:
         subject = subject.without_weight()
     other = fit_branch(list(pulls), lumped(subject, list(pulls), settings), settings, quick=True,
-                       log=EvaluationLog(None, ""), near=replace(found.values, form=()),
+                       log=EvaluationLog(None, ""), near=found.values,
                        progress=progress.keeping([], silently=True))
     require_result(other, skeleton)
     return other
