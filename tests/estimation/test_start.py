@@ -47,9 +47,8 @@ def test_a_start_carries_the_weight(small_bench, pull):
 
 def test_a_beam_bends_as_the_branch_does(objective, small_bench, pull):
     """Its sections' places from base to grasp, far bent, against the tetrahedra at the truth."""
-    forward, values = objective.forwards[0], Values(TRUTH, 0.36, 900.0)
-    beam = initial_modulus.Beam(forward)
-    moved, turns = beam.bent([values])
+    beam = initial_modulus.Beam(objective.forwards[0])
+    moved, turns = beam.bent([Values(TRUTH, 0.36, 900.0)])
     seen = beam.seen[:, -1] - beam.seen[0, -1]
     off = moved[0, :, -1] - moved[0, 0, -1] - seen
     assert np.linalg.norm(seen, axis=1).max() > 0.15

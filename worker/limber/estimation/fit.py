@@ -189,9 +189,6 @@ class _Strategy:
         for rounds_left in reversed(range(starts.ROUNDS)):
             if shifts:
                 forwards = forwards_of(self.pulls, self.subject, self.settings, shifts)
-            for forward in forwards if beams else ():
-                if isinstance(forward, ObservedPathForward):
-                    forward.begin_without(begun.zeros.get(forward.name, np.zeros(3)))
             _begin_at(forwards, known)
             objective = Objective(
                 forwards, parameter_space(self.subject, forwards, self.settings), log=log,
@@ -274,19 +271,18 @@ def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) ->
 def _standing(objective: Objective, start: Values, progress: Progress,
               ) -> tuple[Values, Evaluation]:
     """Return initial values that have equilibria, and their evaluation."""
-    start = starts.scaled_start(objective, start)
-    if any(forward.uses_force for forward in objective.forwards):
-        suspicion = force_unit_suspicion(float(np.exp(np.mean(np.log(start.young)))))
-        if suspicion:
-            progress.warn(suspicion)
-    first = objective.evaluate(objective.space.pack(start), jacobian=True)
-    if first is None:
-        start = starts.scanned(objective, start)
-        first = objective.evaluate(objective.space.pack(start), jacobian=True)
-    if first is None:
+    for drifts in (False, True):
+        begun = starts.scaled_start(objective, start, drifts=drifts)
+        first = objective.evaluate(objective.space.pack(begun), jacobian=True)
+        if first is not None:
+            break
+    else:
         raise _without_equilibrium(objective)
-    _require_stable(objective, start)
-    return start, first
+    if any(forward.uses_force for forward in objective.forwards) and (
+            suspicion := force_unit_suspicion(float(np.exp(np.mean(np.log(begun.young)))))):
+        progress.warn(suspicion)
+    _require_stable(objective, begun)
+    return begun, first
 
 
 def _require_stable(objective: Objective, values: Values) -> None:

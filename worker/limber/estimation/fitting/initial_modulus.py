@@ -14,7 +14,7 @@ from limber.core.numerics.rigid import rotated, rotation_matrix
 from limber.estimation.fitting.objective import Objective, seen_in
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import Forward, key_frames, smoothed, travel
-from limber.estimation.forward.observed_path import AT_REST_M
+from limber.estimation.forward.observed_path import AT_REST_M, ObservedPathForward
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, YOUNG_BOUNDS_PA, Values
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -54,13 +54,12 @@ MOST_DECADES = 6.0
 class Beam:
     """The run from base to grasp of one pull as a rod: ``axis`` [S + 1, 3] as scanned; frames [k]
     with force and torque [k, 3] at ``place`` [k, 3]; ``seen`` [k, m + 1, 3] and ``rest`` are the
-    observed points and, last, the grasp."""
+    observed points and, last, the grasp. ``drifts``: the force's zero may drift."""
 
-    def __init__(self, forward: QuasiStaticForward):
+    def __init__(self, forward: QuasiStaticForward, *, drifts: bool = False):
         self._forward, mesh = forward, forward.mesh
         self.name, self.may_be_off_along = forward.name, forward.may_be_off_along
         self._gravity = forward.model.gravity
-        self._is_prestressed = forward.model.prestress is not None
         skeleton = present(forward.skeleton, "skeleton of a pulled branch")
         grasp = np.array(forward.entry.grasp.point_m)
         run = _run_to(skeleton, grasp)
@@ -85,16 +84,16 @@ class Beam:
         centres = np.vstack([mesh.centroids, *(each.position for each in (*twigs, *added))])
         at = section[tree.query(centres)[1]]
         # Of wood its volume, of what was added its mass.
-        density = float(np.mean(forward.model.density))
-        amounts = np.r_[np.abs(mesh.volumes), [each.mass / density for each in twigs],
-                        [each.mass for each in added]]
+        amounts = np.r_[
+            np.abs(mesh.volumes), [each.mass / np.mean(forward.model.density) for each in twigs],
+            [each.mass for each in added]]
         is_added = (np.arange(len(at)) >= len(at) - len(added)).astype(int)
         self._carried = np.zeros((2, SECTIONS + 1, 4))
         np.add.at(self._carried, (is_added, at), amounts[:, None] * np.column_stack(
             [np.ones(len(at)), centres - self.axis[at]]))
-        self._record(forward, grasp)
+        self._record(forward, grasp, drifts)
 
-    def _record(self, forward: QuasiStaticForward, grasp: np.ndarray) -> None:
+    def _record(self, forward: QuasiStaticForward, grasp: np.ndarray, drifts: bool) -> None:
         """Smooth what was recorded at few frames."""
         frames, entry = forward.frames, forward.entry
         self.is_loaded = entry.drive == "force"
@@ -112,10 +111,13 @@ class Beam:
             :6 if forward.uses_torque else 3]])
         self.place = frames.poses[keys, :3]
         off = grasp - self.place[0]
-        self.zero_sigma = 0.0 if self.is_loaded else calibration_of(entry).force_bias_sigma_n
+        cell = calibration_of(entry)
+        zero = np.full(len(frames), cell.force_bias_sigma_n)
         if not self.is_loaded and np.linalg.norm(off) < AT_REST_M:
-            # The sensor's reading at rest is its zero.
-            wrench, self.place, self.zero_sigma = wrench - wrench[0], self.place + off, 0.0
+            # The sensor's reading at rest is its zero, which drifts from there.
+            wrench, self.place = wrench - wrench[0], self.place + off
+            zero = drifts * cell.force_drift_sigma_n * np.linspace(0.0, 1.0, len(frames))
+        self.zero_sigma, self._keys = zero[:, None] * (not self.is_loaded), keys
         self.force = wrench[:, :3]
         self.torque = wrench[:, 3:] if wrench.shape[1] == 6 else np.zeros_like(self.force)
         points = frames.positions.reshape(len(frames), -1)
@@ -152,36 +154,34 @@ class Beam:
     def bent(self, values: Sequence[Values], zeros: np.ndarray | float = 0.0,
              ) -> tuple[np.ndarray, np.ndarray]:
         """Return ``rest`` moved under each of b values, [b, k, m + 1, 3], and sections' rotations
-        there [b, k, m + 1, 3, 3]; the force read is too large by ``zeros`` [b, 1, 3] [N]."""
+        there [b, k, m + 1, 3, 3]; the force read is too large by ``zeros`` [b, k, 3] [N]."""
         young = np.array([self._field.young(each) for each in values])
         stiffness = young * self._second, young * self._second / (1 + values[0].poisson)
-        gravity = self._gravity
         carried = values[0].density * self._carried[0] + self._carried[1]
-        held = self._hung(carried, self.axis, np.eye(3), gravity) * self._is_prestressed
+        held = self._hung(carried, self.axis, np.eye(3)) * (
+            self._forward.model.prestress is not None)
         shape = (len(values), len(self.force), SECTIONS + 1, 3)
         places, turns = np.empty(shape), np.empty((*shape, 3))
         _bend_rods.of(
             self.axis, *stiffness, np.broadcast_to(self.force - zeros, (*shape[:2], 3)),
             self.torque, np.broadcast_to(self.place, (*shape[:2], 3)),
-            _from_end(carried[:, :1] * gravity), np.broadcast_to(
-                self._hung(carried, self._places, self._turns, gravity), shape),
+            _from_end(carried[:, :1] * self._gravity), np.broadcast_to(
+                self._hung(carried, self._places, self._turns), shape),
             held, places, turns)
         found = turns[:, :, self._at]
         return places[:, :, self._at] + np.einsum(
             "bkmij,mj->bkmi", found, self.rest - self.axis[self._at]), found
 
-    @staticmethod
-    def _hung(carried: np.ndarray, places: np.ndarray, turns: np.ndarray, gravity: np.ndarray,
-              ) -> np.ndarray:
+    def _hung(self, carried: np.ndarray, places: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """Moment of the weight from each section on about the origin, [..., S + 1, 3]."""
         arms = (turns @ carried[:, 1:, None])[..., 0]
-        return _from_end(np.cross(carried[:, :1] * places + arms, gravity))
+        return _from_end(np.cross(carried[:, :1] * places + arms, self._gravity))
 
     def residuals(self, values: Sequence[Values], zeros: np.ndarray) -> np.ndarray:
         """Difference of simulated and recorded motions over their deviation, [b, r]: from the
         first frame on, as places at rest may be wrong; under a stated load, from rest. ``zeros``
-        [b, 3]: of the force, over their deviation."""
-        moved, _ = self.bent(values, self.zero_sigma * zeros[:, None])
+        [b, 1, 3]: of the force, or how far it has drifted, over their deviation."""
+        moved, _ = self.bent(values, zeros * self.zero_sigma[self._keys])
         off = moved - (self.rest if self.is_loaded else moved[:, :1]) - self._motion
         size = float(np.nanmax(np.linalg.norm(self._motion, axis=-1), initial=0.0))
         return np.nan_to_num(off / (BEAM_M + BEAM_SHARE * size)).reshape(len(values), -1)
@@ -189,7 +189,7 @@ class Beam:
     def shifts(self, begun: "BeamStart") -> np.ndarray:
         """Distances of the observed points along the branch from where they are stated [m], [m]."""
         sigma = calibration_of(self._forward.entry).point_sigma_m
-        moved, turns = self.bent([begun.values], begun.zeros.get(self.name, 0.0))
+        moved, turns = self.bent([begun.values], begun.zeros[self.name][self._keys])
         axis = np.gradient(self.axis, axis=0)[self._at[:-1]]
         axis = np.einsum("kmij,mj->kmi", turns[0, :, :-1],
                          axis / np.linalg.norm(axis, axis=1, keepdims=True))
@@ -225,7 +225,7 @@ the origin, less that as scanned, ``held``. Stiffnesses are in N m^2."""
 @dataclass(frozen=True)
 class BeamStart:
     """Moduli by beam theory, which part of the recorded motion they explain (0 to 1), and by pull
-    the zero [N], [3], of a force that was not read at rest."""
+    the zero [N], [f, 3], of a force that drifts, or was not read at rest."""
 
     values: Values
     explained: float
@@ -243,9 +243,9 @@ def unexplained(begun: BeamStart) -> str:
             "its sign, the clocks, the grasp point, and the order of the markers.")
 
 
-def beams_of(forwards: Sequence[Forward]) -> list[Beam]:
+def beams_of(forwards: Sequence[Forward], *, drifts: bool = False) -> list[Beam]:
     """The slow pulls with a measured force as rods."""
-    return [Beam(forward) for forward in forwards if forward.uses_force
+    return [Beam(forward, drifts=drifts) for forward in forwards if forward.uses_force
             and isinstance(forward, QuasiStaticForward) and forward.skeleton is not None]
 
 
@@ -258,23 +258,21 @@ def far_from_stated(beams: Sequence[Beam], begun: BeamStart) -> dict[str, np.nda
 
 def beam_start(beams: Sequence[Beam], base: Values) -> BeamStart:
     """Fit rods to their pulls: uniform moduli of all decades first, then one at each control point;
-    with each the zero of a force that was not read at rest. It does not depend on the moduli of
-    ``base``."""
-    count = len(base.young)
-    unknown = [beam.zero_sigma > 0 for beam in beams]
-    at = count + 3 * (np.cumsum(unknown) - 1)
+    with each the drift of a force, or its zero if it was not read at rest. It does not depend on
+    the moduli of ``base``."""
+    count, step = len(base.young), 1e-3
+    size = count + 3 * len(beams)
 
     def residuals(free: np.ndarray) -> np.ndarray:
         values = [replace(base, young=np.exp(each[:count])) for each in free]
-        known = np.zeros((len(free), 3))
-        return np.hstack([*(beam.residuals(values, free[:, first:first + 3] if is_open else known)
-                            for beam, is_open, first in zip(beams, unknown, at, strict=True)),
-                          np.diff(free[:, :count], axis=1) / LINK_DEVIATION, free[:, count:]])
+        zeros = np.moveaxis(free[:, count:].reshape(len(free), -1, 1, 3), 1, 0)
+        return np.hstack([*(beam.residuals(values, each) for beam, each in zip(
+            beams, zeros, strict=True)),
+            np.diff(free[:, :count], axis=1) / LINK_DEVIATION, free[:, count:]])
 
-    size, step = count + 3 * sum(unknown), 1e-3
     tried = np.zeros((len(DECADES), size))
     tried[:, :count] = np.log(10) * DECADES[:, None]
-    for _ in range(ZERO_ROUNDS if any(unknown) else 0):
+    for _ in range(ZERO_ROUNDS):
         rows = [residuals(tried + step * each) for each in np.eye(size)[count:]]
         now = residuals(tried)
         slopes = (np.array(rows) - now).transpose(1, 2, 0) / step
@@ -291,23 +289,25 @@ def beam_start(beams: Sequence[Beam], base: Values) -> BeamStart:
     found = scipy.optimize.least_squares(
         lambda free: residuals(free[None])[0], np.clip(tried[costs.argmin()], *bound), slopes_at,
         bounds=bound, ftol=BEAM_ENDING, max_nfev=BEAM_ROUNDS)
-    free, young = found.x, np.exp(found.x[:count])
-    zeros = {beam.name: beam.zero_sigma * free[first:first + 3]
-             for beam, is_open, first in zip(beams, unknown, at, strict=True) if is_open}
+    zeros = {beam.name: beam.zero_sigma * each
+             for beam, each in zip(beams, found.x[count:].reshape(-1, 3), strict=True)}
     explained = 1 - 2 * float(found.cost) / max(float(costs[-1]), 1e-300)
-    return BeamStart(replace(base, young=young), explained, zeros)
+    return BeamStart(replace(base, young=np.exp(found.x[:count])), explained, zeros)
 
 
-def scaled_start(objective: Objective, values: Values) -> Values:
-    """Return moduli under which the branch stands and answers the measured force as recorded. A
-    fast pull is fitted step by step; without a force, or where the stiffest rod fits best,
-    some decades are tried."""
+def scaled_start(objective: Objective, values: Values, *, drifts: bool = False) -> Values:
+    """Return moduli under which the branch stands and answers the measured force as recorded,
+    perhaps less a drift, from which the pulls then begin. A fast pull is fitted step by step;
+    without a force, or where the stiffest rod fits best, some decades are tried."""
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
-    beams = beams_of(objective.forwards)
+    beams = beams_of(objective.forwards, drifts=drifts)
     begun = beam_start(beams, values) if beams else None
     if begun is None or begun.values.young.max() >= 0.9 * YOUNG_BOUNDS_PA[1]:
-        return scanned(objective, standing(objective, values))
+        return _scanned(objective, standing(objective, values))
+    for forward in objective.forwards:
+        if isinstance(forward, ObservedPathForward):
+            forward.begin_without(begun.zeros[forward.name])
     return standing(objective, begun.values)
 
 
@@ -330,7 +330,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
                     for forward in objective.forwards]
         short = objective.with_space(likely, forwards)
         if number == 0:
-            values = scanned(short, standing(short, values))
+            values = _scanned(short, standing(short, values))
         fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2,
                            force_rounds=1)
         values = likely.unpack(fit.evaluation.free)
@@ -338,7 +338,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
     return values
 
 
-def scanned(objective: Objective, values: Values) -> Values:
+def _scanned(objective: Objective, values: Values) -> Values:
     """Descend over decades, then halve the step: the objective has one valley along the scale.
     Moduli without equilibrium are too soft: the search begins at the first with one."""
     tried: dict[float, float | None] = {}

@@ -231,8 +231,8 @@ def smoothed(times: np.ndarray, values: np.ndarray, keys: np.ndarray) -> np.ndar
 # Measurement Error Models, 1987, ch. 3).
 
 COURSE_MISFIT = 1.5
-"""Mean squared deviation of readings from their course, over the stated one, above which the course
-gets more key frames. Chosen, not measured.
+"""Mean squared deviation of readings or places from their course, over the stated one, above which
+the course gets more key frames. Chosen, not measured.
 """
 CLIPPED = 4.0
 """Deviations beyond which a reading is an outlier rather than curvature of the force."""
@@ -249,28 +249,30 @@ class Course:
     exact: bool = False
 
 
-def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:
+def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int,
+              pose_sigma: float) -> Course:
     """Fit a smooth course to readings of deviation [f, c] [N, N m], some missing; c is 3, or 6 with
     the torque. A noisy force defines no path, so frames are ordered by time; there are over
-    ``count`` key frames if they cannot follow the readings within the noise."""
+    ``count`` key frames if they cannot follow the readings, or the gripper's places of deviation
+    ``pose_sigma`` [m], within the noise."""
     readings = frames.wrenches[:, :components]
     known = np.isfinite(readings).all(axis=1)
     if np.ptp(readings[known], axis=0).max() == 0.0:
         return Course(np.flatnonzero(known)[:1], np.ones((len(frames), 1)),
                       readings[known][:1], exact=True)
-    along = frames.times - frames.times[0]
+    along, path = frames.times - frames.times[0], frames.poses[:, :3] / pose_sigma
     while True:
         keys, spread = key_frames(along, count)
+        # Averaged readings count more; force and torque are apart.
         weight = 1 / sigma[known]
         values = smoothed(frames.times, readings, frames.times[keys])
-        for axis in range(components):
-            matrix = weight[:, axis, None] * spread[known]
-            missing = weight[:, axis] * (readings[known, axis] - spread[known] @ values[:, axis])
-            values[:, axis] += np.linalg.lstsq(matrix, missing, rcond=1e-3)[0]
-        off = np.clip((readings[known] - spread[known] @ values) * weight, -CLIPPED, CLIPPED)
-        freedom = max(known.sum() - len(keys), 1) * components
-        if len(keys) >= min(len(frames), known.sum()) or (
-                float(np.sum(off**2)) < COURSE_MISFIT * freedom):
+        values += np.linalg.lstsq(weight[:, :1] * spread[known], weight[:, :1] * (
+            readings[known] - spread[known] @ values), rcond=1e-3)[0]
+        beside = ((readings[known] - spread[known] @ values) * weight,
+                  path - spread @ np.linalg.lstsq(spread, path, rcond=None)[0])
+        if len(keys) >= min(len(frames), known.sum()) or all(
+                np.mean(np.clip(each, -CLIPPED, CLIPPED)**2) < COURSE_MISFIT * max(
+                    1 - len(keys) / len(each), 1 / len(each)) for each in beside):
             return Course(keys, spread, values)
         count = 2 * len(keys)
 

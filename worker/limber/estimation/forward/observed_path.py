@@ -303,6 +303,7 @@ class ObservedPathForward(QuasiStaticForward):
             self._drives = list(known[self.keys])
         elif np.linalg.norm(first) < AT_REST_M:
             self._drives = [drive - self._measured[0] for drive in self._drives]
+        self._read = self._drives
         self.keep()
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
@@ -337,8 +338,9 @@ class ObservedPathForward(QuasiStaticForward):
                        for state in held.displacements())
 
     def begin_without(self, zero: np.ndarray) -> None:
-        """Start from the readings less a zero [3] [N]."""
-        self._drives = [np.r_[drive[:3] - zero, drive[3:]] for drive in self._drives]
+        """Start from the readings less a zero at each frame, [f, 3] [N]."""
+        self._drives = [np.r_[drive[:3] - off, drive[3:]]
+                        for drive, off in zip(self._read, zero[self.keys], strict=True)]
         self.keep()
 
     def keep(self) -> None:

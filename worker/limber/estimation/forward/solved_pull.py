@@ -147,7 +147,8 @@ class QuasiStaticForward(Forward):
         else:
             components = 6 if self.uses_torque else 3
             sigma = wrench_sigma(self.entry, frames, components)
-            self._course = course_of(frames, sigma, count, components)
+            self._course = course_of(frames, sigma, count, components,
+                                     self.pose_sigma if self.watches_pose else np.inf)
             self.keys, self.spread = self._course.keys, self._course.spread
             self._measured = self._course.values
             self._drives = list(self._measured)
