@@ -116,6 +116,6 @@ def test_a_fit_does_not_wander_in_what_simulations_do_not_repeat():
 
 def test_a_settled_fit_has_converged_at_its_limit_too():
     """The last simulation that is allowed leads to the end: no other has to tell so."""
-    fit = optimise.gauss_newton(RoughObjective(0.0), TRUTH + [-0.7, 0.7], robust=False,
-                                evaluation_limit=3)
+    fit = optimise.gauss_newton(RoughObjective(0.0), TRUTH + [-0.7, 0.7], is_near=True,
+                                tolerance=1e-12, evaluation_limit=4)
     assert fit.converged and "standard deviations" in fit.reason
