@@ -345,8 +345,8 @@ PARTS = {
     "paper": Part(_paper_table, 20, _TABLE, grows=True),
     "noise": Part(_noise_rows, 90, _NOISE, grows=True),
     "beam": Part(silicone_beam.recording_rows, 30, silicone_beam.RECORDING_ROWS),
-    "other-loads": Part(silicone_beam.other_loads_row, 20, (silicone_beam.OTHER_LOADS,),
-                        grows=True),
+    "other-loads": Part(lambda setting: [silicone_beam.other_loads(setting)[0]], 20,
+                        (silicone_beam.OTHER_LOADS,), grows=True),
     "speed": Part(lambda setting: speed_rows(setting)[:3], 120, _SPEED),
     "depth": Part(_depth_rows, 30, (_DEPTH,), grows=True),
     "force": Part(_force_rows, 60, _FORCE, grows=True)}

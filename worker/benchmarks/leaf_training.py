@@ -9,29 +9,46 @@ version, to the byte.
 """
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.scan_cases import KINDS
+from benchmarks.scan_cases import KINDS, ScanCase
 from benchmarks.scan_probabilities import OWN
-from benchmarks.worlds.sources import BARE_VIEWS, SOURCES, WORLDS
+from benchmarks.worlds.sensors import ALL_AROUND, ONE_SIDED, Scene, strewn
+from benchmarks.worlds.sources import SOURCES, WORLDS
 from limber.geometry.cloud.cloud import Cloud, OwnFrame, thinned
-from limber.geometry.cloud.leaves import TREES, leaves_by_odds, point_spacing, surroundings
+from limber.geometry.cloud.leaves import TREES, find_leaves, in_context, point_spacing, surroundings
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.leaf_removal import leaf_mask
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
 
-_KINDS = (*(f"{source}:leafy" for source in SOURCES), "leafy",
-          *(f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES), "2-mm")
 _TREES, _LEAVES, _RATE, _LEAST = 50, 20, 0.2, 50  # number, ends, learning rate, points of an end
-_MOST = 1500  # points of a scan that are learnt from
+_SEEDS = range(9100, 9108)
+_MOST, _SPARSE = 3000, 300  # most points of a scan that are learnt from; fewest of a thinned one
 LEFT_OUT = ("weber-penn", "dichotomous")
 """Sources that the odds of Limber do not know."""
+
+
+def like_leaves(seed: int, source: str, flat: bool) -> ScanCase:
+    """A bare plant that looks like leaves: its twigs grow beside each other, as on a trellis, or
+    are thinner than the noise and as close as the points."""
+    rng = np.random.default_rng([seed, *source.encode()])
+    plant = SOURCES[source](rng)
+    plant = replace(plant, nodes=plant.nodes * [1.0, rng.uniform(0.0, 0.1) if flat else 1.0, 1.0])
+    seen = (rng.choice((*ONE_SIDED, *ALL_AROUND)) if flat else strewn)(
+        Scene.bare(plant), rng, 0.001 if flat else 0.001 * 5**rng.uniform())
+    return ScanCase(source, seed, plant.skeleton, seen.points)
+
+
+_CASES = WORLDS | {kind: KINDS[kind] for kind in ("leafy", "2-mm")} | {
+    f"{source}:{kind}": partial(like_leaves, source=source, flat=kind == "flat")
+    for kind in ("flat", "strewn") for source in SOURCES}
 
 
 @dataclass(frozen=True)
@@ -46,14 +63,18 @@ class Labelled:
 
 
 def labelled(kind: str, seed: int, out: Path) -> Labelled:
-    """A scan of a kind, from ``out`` if it is there."""
+    """A scan of a kind, from ``out`` if it is there; a quarter of the seeds are thinned."""
     file = out / f"{kind.replace(':', '_')}_{seed}.npz"
     if not file.is_file():
-        case = (KINDS | WORLDS)[kind](seed)
+        case = _CASES[kind](seed)
         settings = ReconstructSettings(**case.settings)
         prepared = prepare(Cloud(case.points), 1.0, settings, up=np.array(settings.up, float))
         points = prepared.cloud.points
         points = points[thinned(points, FIT_POINT_LIMIT)]
+        if seed % 4 == 3:
+            rng = np.random.default_rng([seed, *kind.encode()])
+            few = _SPARSE * (len(points) / _SPARSE)**rng.uniform()
+            points = rng.permutation(points)[:round(few)]
         own = OwnFrame.of(points)
         points = points[own.order]
         truth = np.zeros(len(case.points), bool) if case.leaf is None else case.leaf
@@ -80,29 +101,24 @@ def trained(scans: list[Labelled]) -> Any:
         np.concatenate([scan.leaf[rows] for scan, rows in zip(scans, chosen, strict=True)]))
 
 
-def exported(model: Any) -> dict[str, np.ndarray]:
-    """The trees as arrays, which :mod:`limber.geometry.cloud.leaves` reads."""
+def exported(name: str, model: Any) -> dict[str, np.ndarray]:
+    """Trees of a name as arrays, which :mod:`limber.geometry.cloud.leaves` reads."""
     stages = [stage[0].nodes for stage in model._predictors]
     nodes, counts = np.concatenate(stages), np.array(list(map(len, stages)))
     own, end = np.concatenate(list(map(np.arange, counts))), nodes["is_leaf"].astype(bool)
-    return {"feature": np.where(end, 0, nodes["feature_idx"]).astype(np.int16),
-            "threshold": nodes["num_threshold"].astype(np.float32),
-            "low": np.where(end, own, nodes["left"]).astype(np.int16),
-            "high": np.where(end, own, nodes["right"]).astype(np.int16),
-            "value": nodes["value"].astype(np.float32), "first": np.cumsum(counts) - counts,
-            "depth": np.array([int(stage["depth"].max()) for stage in stages]),
-            "start": np.float64(_prior(model))}
+    return {f"{name}_{key}": value for key, value in {
+        "feature": np.where(end, 0, nodes["feature_idx"]).astype(np.int16),
+        "threshold": nodes["num_threshold"].astype(np.float32),
+        "low": np.where(end, own, nodes["left"]).astype(np.int16),
+        "high": np.where(end, own, nodes["right"]).astype(np.int16),
+        "value": nodes["value"].astype(np.float32), "first": np.cumsum(counts) - counts,
+        "depth": np.array([int(stage["depth"].max()) for stage in stages]),
+        "start": np.float64(np.ravel(model._baseline_prediction)[0])}.items()}
 
 
-def _prior(model: Any) -> float:
-    return float(np.ravel(model._baseline_prediction)[0])
-
-
-def tell(scan: Labelled, model: Any) -> None:
-    """Print the shares of leaf points missed and of wood taken by a classifier."""
-    odds = model.decision_function(scan.features)
-    found = leaf_mask(leaves_by_odds(scan.points, odds, point_spacing(scan.points), _prior(model)),
-                      len(odds))
+def tell(scan: Labelled, odds: np.ndarray) -> None:
+    """Print the shares of leaf points missed and of wood taken, by log ``odds`` [n] of a leaf."""
+    found = leaf_mask(find_leaves(scan.points, odds), len(odds))
     missed = 1 - found[scan.leaf].mean() if scan.leaf.any() else 0.0
     print(f"{scan.kind}: {missed:.1%} of the leaves' points missed, "
           f"{found[~scan.leaf].mean():.1%} of the wood's taken", flush=True)
@@ -111,20 +127,22 @@ def tell(scan: Labelled, model: Any) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Make scans, train, write the trees, and measure them on the sources left out."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--first", type=int, default=9100, help="first seed of each kind")
-    parser.add_argument("--count", type=int, default=3, help="seeds of each kind")
     parser.add_argument("--out", type=Path, required=True, help="folder for the features")
-    parser.add_argument("--left-out", nargs="+", default=LEFT_OUT)
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    scans = [labelled(kind, seed, options.out) for kind in _KINDS
-             for seed in range(options.first, options.first + options.count)]
-    model = trained([scan for scan in scans if scan.source not in options.left_out])
-    if tuple(options.left_out) == LEFT_OUT:
-        np.savez_compressed(TREES, **exported(model))
+    scans = [labelled(kind, seed, options.out) for kind in _CASES for seed in _SEEDS]
+    inside = [scan for scan in scans if scan.source not in LEFT_OUT]
+    shape = trained(inside)
+    # Of a scan that they learnt from, trees are surer than of another.
+    others = {source: trained([scan for scan in inside if scan.source != source])
+              for source in {scan.source for scan in scans}}
+    scans = [replace(scan, features=in_context(scan.points, scan.features, others[
+        scan.source].decision_function(scan.features))) for scan in scans]
+    model = trained([scan for scan in scans if scan.source not in LEFT_OUT])
+    np.savez_compressed(TREES, **exported("shape", shape), **exported("context", model))
     for scan in scans:
-        if scan.source in options.left_out:
-            tell(scan, model)
+        if scan.source in LEFT_OUT:
+            tell(scan, model.decision_function(scan.features))
 
 
 if __name__ == "__main__":

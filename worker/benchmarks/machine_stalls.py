@@ -76,17 +76,14 @@ class Witness:
         Consecutive pieces within the 60 ms in which a robot's data grows too old count as one: a
         host takes its time away like this.
         """
-        return max(self._longest_of([one for one in seen if one[0] > since - _TOGETHER_SECONDS],
-                                    since) for seen in map(tuple, self._seen))
+        near = [[one for one in tuple(seen) if one[0] > since - _TOGETHER_SECONDS]
+                for seen in self._seen]
+        return max((max(seconds, self._lost_of(seen, moment - _TOGETHER_SECONDS, moment))
+                    for seen in near for moment, seconds in seen if moment > since), default=0.0)
 
     def lost(self, since: float, until: float) -> float:
         """Return the largest total stall of a processor between two moments [s]."""
         return max(self._lost_of(tuple(seen), since, until) for seen in self._seen)
-
-    @classmethod
-    def _longest_of(cls, seen: Sequence[tuple[float, float]], since: float) -> float:
-        return max((max(seconds, cls._lost_of(seen, moment - _TOGETHER_SECONDS, moment))
-                    for moment, seconds in seen if moment > since), default=0.0)
 
     @staticmethod
     def _lost_of(seen: Sequence[tuple[float, float]], since: float, until: float) -> float:

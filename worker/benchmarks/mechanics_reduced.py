@@ -123,8 +123,9 @@ _TESTED, _TESTS = 300, 10  # test grasps, and those of one trial
 def pinned_rows(setting: Setting) -> list[Row]:
     """Measure pinned grasps with known moduli, steps in time, and a session."""
     progress, bench = setting.progress, GraspBench(bench_branch())
-    known = _with_known_young(bench.take(setting.at_most(120, 50), 1.0, setting.generator(53, 1),
-                                         None, progress.part(0.0, 0.5)))
+    known = bench.take(setting.at_most(120, 50), 1.0, setting.generator(53, 1), None,
+                       progress.part(0.0, 0.5))
+    known = replace(known, young_tangents=known.young_tangents[:, :0])
     held_out = bench.take(setting.at_most(40, 10), 1.0, setting.generator(53, 2), known,
                           progress.part(0.5, 0.7))
     reduced = bench.reduce(known, KNOWN)
@@ -137,10 +138,6 @@ def pinned_rows(setting: Setting) -> list[Row]:
         Row(*PINNED_ROWS[1], f"{steps.min():.2f} / {np.median(steps):.2f} ms ({reduced.size} "
             "coordinates)", bool(np.median(steps) <= 1.0)),
         Row(*PINNED_ROWS[2], *run_session(bench, reduced, known, 4.0 if setting.quick else 15.0))]
-
-
-def _with_known_young(snapshots: Snapshots) -> Snapshots:
-    return replace(snapshots, young_tangents=snapshots.young_tangents[:, :0])
 
 
 class GraspBench:

@@ -357,11 +357,6 @@ def _field_cost(setting: Setting) -> list[Row]:
                 found[0][1] <= 10.0 and found[1][1] <= 22.0, len(found))]
 
 
-def _error_asked(what: str, asked: tuple[float, float], unit: str) -> Asked:
-    return Asked(f"field error on fresh poses: {what}, median / 95 %",
-                 f"{asked[0]} / {asked[1]} {unit}")
-
-
 _SAVED = tuple(Asked(f"random starts, default weights: saved against {name}", "-")
                for name in AGAINST)
 _FROM_REST = Asked("from rest, all branches: saved against the straight line", "-")
@@ -384,7 +379,9 @@ _REST_INSIDE = Asked("rest pose inside the sampled region: least depth", "inside
 _WITHOUT_FIELD = Asked("branches without a field", "none")
 _NOT_TRUSTED = Asked("of the samples' hull not trusted, mean / most; fresh trusted poses where the "
                      "motion does not come", "-")
-_FIELD_ERRORS = tuple(_error_asked(what, asked, unit) for _, what, _, asked, unit in _ERRORS)
+_FIELD_ERRORS = tuple(Asked(f"field error on fresh poses: {what}, median / 95 %",
+                            f"{median} / {most} {unit}")
+                      for _, what, _, (median, most), unit in _ERRORS)
 
 PARTS = {
     "field": Part(_field_rows, 120, (*_FIELD_ERRORS, _REST_INSIDE, _WITHOUT_FIELD, _NOT_TRUSTED),

@@ -144,10 +144,6 @@ def _in_unit(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cl
                    lambda places: places * factor, lambda places: places / factor)
 
 
-def _shuffled(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return points[rng.permutation(len(points))]
-
-
 def _doubled(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A fifth of the points twice."""
     return np.vstack([points, points[rng.choice(len(points), len(points) // 5, replace=False)]])
@@ -217,9 +213,9 @@ def _noisy(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 CHANGED = {AS_IT_IS: _as_it_is, "half": _of_points(_half), "turn": _turned,
-           "shuffle": _of_points(_shuffled), "shift": _shifted, "unit": _in_unit,
-           "duplicates": _of_points(_doubled), "outliers": _of_points(_with_outliers),
-           "ground": _on_ground, "threads": _as_it_is}
+           "shuffle": _of_points(lambda points, rng: rng.permutation(points)), "shift": _shifted,
+           "unit": _in_unit, "duplicates": _of_points(_doubled),
+           "outliers": _of_points(_with_outliers), "ground": _on_ground, "threads": _as_it_is}
 """Changes to a scan, the most informative first."""
 DEGRADED: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
     "one-sided": _one_sided, "cut": _cut, "noisy": _noisy}

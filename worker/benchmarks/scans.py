@@ -185,25 +185,18 @@ def _nothing(rows: tuple[Asked, ...], one: Outcomes) -> list[Row]:
             for asked in rows] if one.count else []
 
 
-def _rows_of(setting: Setting, kinds: tuple[str, ...],
-             rows: Callable[[dict[str, Outcomes]], list[Row]]) -> list[Row]:
-    """The rows of cases of some kinds, as many as there is time for."""
-    return rows(outcomes(setting, {
-        kind: setting.at_most(_COUNTS[kind], max(_COUNTS[kind] // _QUICK, 2)) for kind in kinds}))
-
-
-def _part(kind: str, rows: Callable[[Outcomes], list[Row]], gives: tuple[Asked, ...],
-          seconds: float = 30.0) -> Part:
-    """The part for one kind of case."""
-    of_kind = partial(_rows_of, kinds=(kind,), rows=lambda done: rows(done[kind]))
-    return Part(of_kind, seconds, gives, grows=True)
+def _part(kind: str, rows: Callable[[Outcomes], list[Row]], gives: tuple[Asked, ...]) -> Part:
+    """The part for one kind of case, of as many as there is time for."""
+    def of_kind(setting: Setting) -> list[Row]:
+        count = setting.at_most(_COUNTS[kind], max(_COUNTS[kind] // _QUICK, 2))
+        return rows(outcomes(setting, {kind: count})[kind])
+    return Part(of_kind, 30, gives, grows=True)
 
 
 # --- worlds -------------------------------------------------------------------------------------
 
 _WORLD_COUNT, _WORLD_QUICK = 24, 1  # cases of a source and view
 _DRESSED = 6  # cases of a source in leaf
-_WORLDS = ", worlds"
 # Forks found and false, twigs found and false, radius bias, worst volume.
 _LIMITS = {"one-sided": (0.90, 0.08, 0.90, 0.05, 0.04, 0.10),
            "round": (0.96, 0.03, 0.95, 0.03, 0.02, 0.05)}
@@ -300,16 +293,15 @@ def things_rows(setting: Setting) -> list[Row]:
 
 def world_rows(setting: Setting) -> list[Row]:
     """All rows of generated worlds."""
-    chosen = list(SOURCES)
     count = setting.at_most(_WORLD_COUNT, _WORLD_QUICK)
-    dressed = {f"{name}:leafy": setting.at_most(_DRESSED, _WORLD_QUICK) for name in chosen}
-    done = outcomes(setting, {f"{name}:{view}": count for view in BARE_VIEWS for name in chosen}
+    dressed = {f"{name}:leafy": setting.at_most(_DRESSED, _WORLD_QUICK) for name in SOURCES}
+    done = outcomes(setting, {f"{name}:{view}": count for view in BARE_VIEWS for name in SOURCES}
                     | dressed)
-    rows = [row for view in BARE_VIEWS for name in chosen
+    rows = [row for view in BARE_VIEWS for name in SOURCES
             for row in source_rows(name, view, done[f"{name}:{view}"])]
-    rows += probability_rows(_WORLDS, [done[f"{name}:{view}"] for name in chosen
-                                                  for view in BARE_VIEWS])
-    dress = {key: [done[f"{name}:{key}"] for name in chosen]
+    rows += probability_rows(", worlds", [done[f"{name}:{view}"] for name in SOURCES
+                                          for view in BARE_VIEWS])
+    dress = {key: [done[f"{name}:{key}"] for name in SOURCES]
              for key in (*BARE_VIEWS, "leafy")}
     return [*rows, *dropped_rows(dress["one-sided"] + dress["round"]), *leafy_rows(dress["leafy"])]
 
@@ -321,7 +313,7 @@ def _together(several: list[Outcomes]) -> Outcomes:
 WORLDS = {
     "worlds": Part(world_rows, 120, (*(source_asked(source, view) for view in BARE_VIEWS
                                        for source in SOURCES), *probability_asked(
-                                           _WORLDS), DROPPED, LEAFY),
+                                           ", worlds"), DROPPED, LEAFY),
                    grows=True),
     "things": Part(things_rows, 30, (THINGS,), grows=True),
     "worlds-real": Part(real_scans.length_rows, 90, (real_scans.REAL, real_scans.BARE,

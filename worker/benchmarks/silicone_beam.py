@@ -234,11 +234,6 @@ def recording_rows(_setting: Setting) -> list[Row]:
         Row(*RECORDING_ROWS[1], others, None)]
 
 
-def other_loads_row(setting: Setting) -> list[Row]:
-    """Drawn beams, weighed with one load: errors of the predicted drops under others."""
-    return [_other_loads(setting)[0]]
-
-
 def beam_rows(setting: Setting) -> list[Row]:
     """One simulated recording over three meshes, and drops under other loads."""
     rng, found = setting.generator(41), []
@@ -259,10 +254,12 @@ def beam_rows(setting: Setting) -> list[Row]:
                 f"{', '.join(f'{value / 1e3:.1f}' for value in young)} kPa on "
                 f"{', '.join(str(6 * int(np.prod(cells))) for cells in _MESHES)} tetrahedra)",
                 bool(spread <= 0.007), len(found)),
-            *([_other_loads(setting)[1]] if FOLDER.is_dir() else [])]
+            *([other_loads(setting)[1]] if FOLDER.is_dir() else [])]
 
 
-def _other_loads(setting: Setting) -> tuple[Row, Row]:
+def other_loads(setting: Setting) -> tuple[Row, Row]:
+    """Drawn beams, weighed with one load: errors of the predicted drops, and of those under others.
+    """
     trials = setting.trials("beam", setting.seeds(6, 1), _simulated, "estimation", "mechanics")
     off = column(trials, "off")
     held = sum(trial["held"] for trial in trials)

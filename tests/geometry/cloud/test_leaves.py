@@ -11,7 +11,7 @@ from benchmarks.scan_cases import leafy_case
 from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.leaves import Leaf, find_leaves, leaves_by_odds
+from limber.geometry.cloud.leaves import Leaf, find_leaves
 from limber.geometry.cloud.preparation import Prepared, prepare
 from limber.geometry.cloud.surroundings import Part
 from limber.geometry.generated import generate_branch
@@ -222,9 +222,9 @@ def test_a_stem_seen_from_one_side_is_no_leaf() -> None:
                       _tube([0, 0, 1.8], [0.3, 0.2, 2.0], 0.01, 0.01, rng, view)])
     stem += rng.normal(0, 3e-3, stem.shape)
     prepared = prepare(Cloud(stem), 1.0, ReconstructSettings(), up=np.array([0.0, 0.0, 1.0]))
-    assert without_leaves(prepared)[1] == []
     found = skeletonise(prepared.cloud.points)
     assert _on_round_axes(found, prepared.cloud.points).mean() > 0.5
+    assert without_leaves(prepared, found)[1] == []
 
 
 @pytest.mark.parametrize("count", [1, 3, 39, 40, 60, 100, 250])
@@ -254,19 +254,17 @@ def test_lines_in_a_plane_fill_no_sheet() -> None:
     assert len(leaf.points) > 0.9 * 1400
 
 
-def test_doubtful_leaves_are_judged_by_the_sure_ones() -> None:
-    """The same patch beside many sure leaves is one; on a bare branch with a single one it is not.
-    """
+def test_specks_go_with_the_nearest_leaf() -> None:
+    """A few points that look like a leaf are one's rim where there is one, and else none; so is a
+    doubtful one where there are few."""
     grid = 0.001 * np.stack(np.meshgrid(range(10), range(10), [0.0]), axis=-1).reshape(-1, 3)
-    line = 0.001 * np.stack([np.arange(900), np.full(900, -100), np.zeros(900)], axis=1)
-
-    def found(sure: int) -> list[int]:
-        points = np.vstack([line, *(grid + [0.1 * k, 0, 0] for k in range(sure + 1))])
-        odds = np.concatenate([np.full(900, -4.0), np.full(100, 2.0), np.full(100 * sure, 4.0)])
-        return sorted(int(leaf.points.min()) for leaf in leaves_by_odds(points, odds, 0.001, -1.4))
-
-    assert found(7) == [900 + 100 * k for k in range(8)]
-    assert found(1) == [1000]
+    points = np.vstack([grid, grid[:9] + [0.02, 0, 0], grid + [0.1, 0, 0]])
+    assert sorted(len(leaf.points) for leaf in find_leaves(points, np.full(209, 2.0))) == [100, 109]
+    only, = find_leaves(points, np.where(np.arange(209) < 109, -2.0, 2.0))
+    assert sorted(only.points) == list(range(109, 209))
+    assert find_leaves(points[100:], np.where(np.arange(109) < 9, 2.0, -2.0)) == []
+    twigs = np.vstack([points, 0.001 * np.arange(15_000).reshape(-1, 3)])  # a doubtful one is wood
+    assert find_leaves(twigs, np.repeat([-2.0, 0.5, -4.0], [109, 100, 5000])) == []
 
 
 @pytest.mark.slow

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import expit
 
 from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import thinned
-from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_evidence
+from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_log_odds
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
 from limber.geometry.cloud.surroundings import Part
 from limber.geometry.skeleton.search_result import SkeletonResult
@@ -32,16 +33,26 @@ _MOST = 0.5  # fraction of points that decides
 _ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 
+def point_odds(points: np.ndarray) -> np.ndarray:
+    """Logarithm of the odds that each of points [n, 3] [m] is on a leaf, shape [n], found on as
+    many as a fit of axes uses; others have their nearest's. On closer points neighbourhoods a few
+    spacings wide show the scan's noise, and take too much memory."""
+    some = thinned(points, FIT_POINT_LIMIT)
+    return leaf_log_odds(points[some])[cKDTree(points[some]).query(points)[1]]
+
+
 def without_leaves(prepared: Prepared, found: SkeletonResult | None = None,
-                   supports: Sequence[Part] = ()) -> tuple[Prepared, list[Leaf]]:
+                   supports: Sequence[Part] = (), odds: np.ndarray | None = None,
+                   ) -> tuple[Prepared, list[Leaf]]:
     """Return the wood of a scan, and the removed leaves: none if they have under 5 % of the
     points. ``supports``, and what is round by ``found``, the whole scan's skeleton, are no leaves.
-    """
+    ``odds`` [n] are :func:`point_odds`, if known."""
     points = prepared.cloud.points
+    odds = point_odds(points) if odds is None else odds
     none = np.zeros(len(points), bool) if found is None else _on_round_axes(found, points)
     for support in supports:
         none[support.points] = True
-    leaves = [leaf for leaf in _leaves_of(points) if none[leaf.points].mean() < _MOST]
+    leaves = [leaf for leaf in _leaves_of(points, odds) if none[leaf.points].mean() < _MOST]
     if leaf_mask(leaves, len(points)).mean() < _LEAST:
         return prepared, []
     return cut_off(prepared, leaves)
@@ -55,25 +66,24 @@ def cut_off(prepared: Prepared, leaves: list[Leaf]) -> tuple[Prepared, list[Leaf
     return replace(prepared, cloud=prepared.cloud.subset(wood)), leaves
 
 
-def _leaves_of(points: np.ndarray) -> list[Leaf]:
-    """Find leaves on as many points as a fit of axes uses; others go with the nearest. On closer
-    points neighbourhoods a few spacings wide show the scan's noise, and take too much memory."""
+def _leaves_of(points: np.ndarray, odds: np.ndarray) -> list[Leaf]:
+    """Leaves found on as many points; others go with the nearest."""
     some = thinned(points, FIT_POINT_LIMIT)
-    leaves = find_leaves(points[some])
-    if len(some) == len(points) or not leaves:
-        return leaves
-    leaf_of = np.full(len(some), -1)
-    for number, leaf in enumerate(leaves):
-        leaf_of[leaf.points] = number
-    own = leaf_of[cKDTree(points[some]).query(points)[1]]
-    return [Leaf(np.flatnonzero(own == number), leaf.area) for number, leaf in enumerate(leaves)]
+    near = cKDTree(points[some]).query(points)[1]
+    return [replace(leaf, points=np.flatnonzero(np.isin(near, leaf.points)))
+            for leaf in find_leaves(points[some], odds[some])]
+
+
+def leafy_spread(odds: np.ndarray, leaves: list[Leaf]) -> float:
+    """Standard deviation of the logarithm of the length of axes from which ``leaves`` were cut off:
+    how many of the scan's points of log ``odds`` [n] are likely misjudged, over those of wood."""
+    leaf = expit(odds)
+    return float(np.where(leaf_mask(leaves, len(odds)), 1 - leaf, leaf).sum() / (1 - leaf).sum())
 
 
 def show_leaves(prepared: Prepared, off: np.ndarray) -> bool:
     """Whether most of a scan's points off all axes, of mask ``off`` [n], look like leaves."""
-    some = thinned(prepared.cloud.points, FIT_POINT_LIMIT)
-    like = leaf_evidence(prepared.cloud.points[some])[off[some]] > 0
-    return like.size > 0 and float(like.mean()) > _MOST
+    return bool(off.any()) and float(np.mean(point_odds(prepared.cloud.points)[off] > 0)) > _MOST
 
 
 def check_agreed(prepared: Prepared, leaves: list[Leaf]) -> None:

@@ -26,7 +26,9 @@ from limber.geometry.leaf_removal import (
     cut_off,
     leaf_mask,
     leaf_masses,
+    leafy_spread,
     leaves_text,
+    point_odds,
     show_leaves,
     without_leaves,
 )
@@ -112,10 +114,7 @@ Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 _OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # columns of cloud.ply that Limber writes
 # A twig is kept if, as seen by a depth camera, it reaches this many radii beyond its parent's axis.
 _SILHOUETTE_REACH = 1.5
-# Fraction of points on no round axis above which leaves are searched for. Deviation of the
-# logarithm of the length where some were cut off, from 12 generated scans: what is left of them
-# lengthens axes by a sixth, and what twigs are likely does not show it.
-_LEAVES_ASKED, _LEAFY_SPREAD = 0.2, 0.21
+_LEAVES_ASKED = 0.2  # fraction of points on no round axis above which leaves are searched for
 
 
 @dataclass(frozen=True)
@@ -265,14 +264,15 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     if own is not None or settings.leaves == "keep" or found.length_spread is not None or not (
             _may_be_leafy(found, prepared, settings)):
         return found, prepared, []
-    wood, leaves = without_leaves(prepared, found, supports)
+    odds = point_odds(prepared.cloud.points)
+    wood, leaves = without_leaves(prepared, found, supports, odds)
     if settings.leaves == "ask":
         with shown_if_refused(show, prepared, leaves, supports):
             check_agreed(prepared, leaves)
     if not leaves:
         return found, prepared, []
     bare = _skeleton(wood, settings, own, progress.part(0.55, 1.0))
-    spread = float(np.hypot(_LEAFY_SPREAD, bare.length_spread or 0.0))
+    spread = float(np.hypot(leafy_spread(odds, leaves), bare.length_spread or 0.0))
     return replace(bare, length_spread=spread), wood, leaves
 
 

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.special import expit, logit
 
 from limber.core.files.reading import read_arrays
 from limber.geometry.cloud.cloud import OwnFrame
@@ -59,12 +61,44 @@ def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray
     return np.maximum(np.linalg.eigvalsh(second), 0.0), count
 
 
-def leaf_log_odds(features: np.ndarray) -> np.ndarray:
-    """Logarithm of the odds that each point is on a leaf, shape [n], from its surroundings."""
-    trees, total = _trees(), np.empty(len(features))
-    _voted.of(features, *(trees[name] for name in (
+_REACHES = (0, 1, 2, 4, 8, 16, 32, 64)  # rounds of averaging over the nearest points
+_MOST_ODDS = 4.0  # logarithm of the odds above which a single point is no more evidence
+ALIKE = 16
+"""Neighbours whose evidence counts for a point, and once for all."""
+
+
+def leaf_log_odds(points: np.ndarray) -> np.ndarray:
+    """Logarithm of the odds that each of points [n, 3] [m] is on a leaf, shape [n].
+
+    What one part looks like may deceive, as on a leaf's rim. So further trees judge it by the odds
+    around it too (Tu 2008, doi:10.1109/CVPR.2008.4587436).
+    """
+    own = OwnFrame.of(points)
+    spacing, odds = point_spacing(own.coordinates), np.full(len(points), -_MOST_ODDS)
+    if len(points) >= _SMALLEST and spacing > 0:  # else neighbourhoods have no shape
+        shape = surroundings(own.coordinates, spacing)
+        odds[own.order] = voted(in_context(own.coordinates, shape, voted(shape, "shape")),
+                                "context")
+    return odds
+
+
+def in_context(points: np.ndarray, shape: np.ndarray, odds: np.ndarray) -> np.ndarray:
+    """The ``shape`` of surroundings [n, 44], and the log ``odds`` [n] of points on average over
+    ever wider ones, shape [n, 52]."""
+    odds, count = np.clip(odds, -_MOST_ODDS, _MOST_ODDS), len(points)
+    near = cKDTree(points).query(points, k=min(ALIKE, count))[1]
+    step = csr_matrix((np.full(near.size, 1 / near.shape[1]), near.ravel(), np.arange(
+        0, near.size + 1, near.shape[1])), (count, count))
+    wider = list(accumulate(range(_REACHES[-1]), lambda around, _: step @ around, initial=odds))
+    return np.column_stack([shape, *(wider[reach] for reach in _REACHES)]).astype(np.float32)
+
+
+def voted(features: np.ndarray, trees: str) -> np.ndarray:
+    """Logarithm of the odds that each point is on a leaf, shape [n], by the trees of a name."""
+    arrays, total = _trees(), np.empty(len(features))
+    _voted.of(features, *(arrays[f"{trees}_{name}"] for name in (
         "first", "depth", "feature", "threshold", "low", "high", "value")), total,
-        float(trees["start"]))
+        float(arrays[f"{trees}_start"]))
     return total
 
 
@@ -74,11 +108,6 @@ _voted = Kernel(
     "value float64[nodes]", "out total float64[rows]", "start float")
 
 
-def prior_log_odds() -> float:
-    """Logarithm of the odds that any point is on a leaf, in the scans of the training."""
-    return float(_trees()["start"])
-
-
 @cache
 def _trees() -> dict[str, np.ndarray]:
     return read_arrays(TREES, "the classifier of leaves, a part of Limber")
@@ -86,13 +115,8 @@ def _trees() -> dict[str, np.ndarray]:
 
 _SMALLEST = 40  # fewest points of a leaf
 _NEAR = 3.0  # largest distance between connected points, in spacings
-ALIKE = 16
-"""Neighbours whose evidence counts for a point, and once for all."""
-_ROUNDS = 2  # how often
-_MOST_ODDS = 4.0  # logarithm of the odds above which a single point is no more evidence
-# Mean of it from which a piece is a leaf: first by the training's fraction of leaf points, then by
-# the scan's own, which is at least and at most this.
-_LIKELY, _SHARES = 2.5, (0.005, 0.95)
+_ROUNDS = 50  # until the fraction on leaves has settled
+_LIKELY = 2.5  # logarithm of a leaf's odds: wood that is taken for one is a dozen times worse
 
 
 @dataclass(frozen=True)
@@ -103,19 +127,40 @@ class Leaf:
     area: float
 
 
-def find_leaves(points: np.ndarray) -> list[Leaf]:
-    """Find the leaves of a scan of points [n, 3] [m]."""
-    own = OwnFrame.of(points)
-    return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.coordinates)]
+def find_leaves(points: np.ndarray, odds: np.ndarray | None = None) -> list[Leaf]:
+    """Find the leaves of a scan of points [n, 3] [m]; ``odds`` [n] are :func:`leaf_log_odds`, if
+    known. They are connected points; specks go with the nearest. A piece is as likely one as its
+    points are, and its odds move with the fraction on leaves in this scan, so a few flat clumps are
+    none (Saerens, Latinne and Decaestecker 2002, doi:10.1162/089976602753284446)."""
+    frame, odds = OwnFrame.of(points), leaf_log_odds(points) if odds is None else odds
+    own = frame.order[odds[frame.order] > 0]
+    if len(own) < _SMALLEST:
+        return []
+    tree = cKDTree(points[own])
+    pairs = tree.query_pairs(_NEAR * point_spacing(frame.coordinates), output_type="ndarray")
+    label = connected_components(coo_matrix((np.ones(len(pairs)), pairs.T), 2 * own.shape))[1]
+    if not (large := np.bincount(label)[label] >= _SMALLEST).any():
+        return []
+    label = label[large][cKDTree(points[own[large]]).query(points[own])[1]]
+    pieces = [np.flatnonzero(label == piece) for piece in np.unique(label)]
+    like = logit([expit(odds[own[piece]]).mean() for piece in pieces])
+    share = 1 / len(points)
+    for _ in range(_ROUNDS):  # from a bare scan on, so that it is one unless shown otherwise
+        shift = logit(share) - _trees()["context_start"]
+        share = expit(like + shift) @ np.array(list(map(len, pieces))) / len(points)
+    # The median is used: at a leaf's edge, neighbours are missing on one side.
+    area = np.pi * tree.query(points[own], k=9)[0][:, -1]**2 / 8
+    return [Leaf(own[piece], len(piece) * float(np.median(area[piece])))
+            for piece, is_leaf in zip(pieces, like + shift > _LIKELY, strict=True) if is_leaf]
 
 
 def leaf_evidence(points: np.ndarray) -> np.ndarray:
     """What each point's surroundings add to the logarithm of the odds that a scan shows leaves,
     shape [n]: over 0 if it is likelier on one. Neighbours share theirs, which count once."""
     own = OwnFrame.of(points)
-    spacing, odds = point_spacing(own.coordinates), np.full(len(points), prior_log_odds())
+    spacing, odds = point_spacing(own.coordinates), np.full(len(points), _trees()["shape_start"])
     if len(points) >= _SMALLEST and spacing > 0:
-        odds[own.order] = leaf_log_odds(surroundings(own.coordinates, spacing))
+        odds[own.order] = voted(surroundings(own.coordinates, spacing), "shape")
     return np.clip(odds, -_MOST_ODDS, _MOST_ODDS) / ALIKE
 
 
@@ -123,55 +168,3 @@ def point_spacing(points: np.ndarray) -> float:
     """Median distance between neighbouring points [m]; 0 where most coincide with another."""
     some = points[::max(1, len(points) // 5000)]
     return float(np.median(cKDTree(points).query(some, k=2)[0][:, 1]))
-
-
-def _found(points: np.ndarray) -> list[Leaf]:
-    if len(points) < _SMALLEST:
-        return []
-    spacing = point_spacing(points)
-    if spacing <= 0:
-        return []  # Neighbourhoods have no shape.
-    return leaves_by_odds(points, leaf_log_odds(surroundings(points, spacing)), spacing,
-                          prior_log_odds())
-
-
-def leaves_by_odds(points: np.ndarray, odds: np.ndarray, spacing: float, prior: float,
-                   ) -> list[Leaf]:
-    """Find leaves by each point's log odds [n] of being on one; ``prior`` is that of any point of
-    the training. They move with the fraction on leaves in this scan, so a few flat clumps are none
-    (Saerens, Latinne and Decaestecker 2002, doi:10.1162/089976602753284446)."""
-    odds = np.clip(odds, -_MOST_ODDS, _MOST_ODDS)
-    near = cKDTree(points).query(points, k=min(ALIKE, len(points)))[1]
-    for _ in range(_ROUNDS):
-        odds = odds[near].mean(axis=1)
-    certain = [leaf for leaf in _pieces(points, odds > 0, _NEAR * spacing)
-               if odds[leaf.points].mean() > _LIKELY]
-    share = np.clip(sum(len(leaf.points) for leaf in certain) / len(points), *_SHARES)
-    odds += np.log(share / (1 - share)) - prior
-    return [leaf for leaf in _pieces(points, odds > 0, _NEAR * spacing)
-            if odds[leaf.points].mean() > _LIKELY]
-
-
-def _labels(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which connected piece each point belongs to, shape [n], and the pieces' sizes."""
-    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), (len(points), len(points)))
-    label = connected_components(graph, directed=False)[1]
-    return label, np.bincount(label)
-
-
-def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]:
-    """Connected points of leaves, without specks."""
-    own = np.flatnonzero(on_leaf)
-    if len(own) < _SMALLEST:
-        return []
-    label, count = _labels(points[own], reach)
-    around = min(9, len(own))
-    distance = cKDTree(points[own]).query(points[own], k=around)[0][:, -1]
-    area = np.pi * distance**2 / (around - 1)
-    leaves = []
-    for piece in np.flatnonzero(count >= _SMALLEST):
-        members = np.flatnonzero(label == piece)
-        # The median is used: at a leaf's edge, neighbours are missing on one side.
-        leaves.append(Leaf(own[members], len(members) * float(np.median(area[members]))))
-    return leaves
