@@ -349,14 +349,13 @@ def test_a_bound_is_for_all_of_the_goal_where_paths_end_deeper_in_it(well_field,
     drawn_in = replace(drawn_in, weights=asked.weights)
     lower = [certify(one, lambda _: np.inf).lower for one in (asked, mixed, drawn_in)]
     assert lower[1] == pytest.approx(lower[0], rel=0.02)
-    assert lower[2] > 1.01 * lower[1] > 0.0
+    assert lower[2] > 1.002 * lower[1] > 0.0
 
 
 @pytest.mark.slow
-def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
+def test_no_point_of_a_targets_goal_costs_more_than_nothing(well_field):
     """By brute force, on three grids: its cell has all its coefficients, and the spline of the cost
-    left is at most what is taken off the bound. The target moves farther than the grasp, at another
-    rate at each place."""
+    left is at most 0. The target moves farther than the grasp, at another rate at each place."""
     goal = Goal(TIP, Ball((0.15, 0.09, 0.33), 0.02))
     problem = problem_on(well_field, goal=goal)
     points = goal.guess(well_field, 4000, np.random.default_rng(3))
@@ -380,17 +379,17 @@ def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
             assert goal_cells.known[where].all()
             value += costs[where] * np.prod([
                 weights[step, :, axis] for axis, step in enumerate(offset)], axis=0)
-        assert value.max() <= goal_cells.slack(costs)
+        assert value.max() <= 0.0
         grid, cell = refined(grid, rates.open_cells, goal_cells.near, cell, 0.6)
 
 
-def test_the_slack_counts_the_curvature_beside_the_border():
-    """A cost that bends in the cell next to the border bends the spline in the border's as well."""
-    everywhere, nothing = np.ones((7, 7, 7), bool), np.zeros((7, 7, 7), bool)
-    border, costs = nothing.copy(), np.zeros((7, 7, 7))
-    border[3, 3, 3], costs[5:] = True, 1.0
-    goal = lower_bound.AboutGoal(everywhere, costs, nothing, border, True, nothing)
-    assert goal.slack(costs) == pytest.approx(lower_bound.CURVATURE_FACTOR / 8.0)
+def test_a_cost_is_lowered_for_its_curvature_beside_the_border():
+    """A cost that bends in the cell next to the border bends the spline in the border's as well:
+    all coefficients of its spline are lowered."""
+    border, costs = np.zeros((9, 9, 9), bool), np.zeros((9, 9, 9))
+    border[4, 4, 4], costs[6:] = True, 1.0
+    lowered = lower_bound._bent_up(costs, border)
+    assert lowered[3:6, 3:6, 3:6] == pytest.approx(lower_bound.CURVATURE_FACTOR / 8.0)
 
 
 class Jump(Goal):

@@ -204,7 +204,7 @@ KERNEL void cells_numbered(const int64_t* cells, int32_t* numbers, int32_t* near
 }
 
 // Fast marching: |grad u| = rate [1/m] (Sethian 1999), second order where possible. Arrival costs u [n],
-// infinite where unreachable, from neighbours [n, 6], values [n] at `known` nodes, and edges [3] [m].
+// infinite where unreachable, from neighbours [n, 6], values [n] that `known` nodes have at most, and edges [3] [m].
 KERNEL void fast_marching(const double* rate, const int32_t* near, const uint8_t* known, const double* values,
                           const double* edges, double* u, int64_t count) {
   Scratch<uint8_t> done(count);
@@ -219,7 +219,7 @@ KERNEL void fast_marching(const double* rate, const int32_t* near, const uint8_t
     done[node] = 1;
     for (int side = 0; side < 6; ++side) {
       const int32_t other = near[6 * node + side];
-      if (other < 0 || done[other] || known[other]) continue;
+      if (other < 0 || done[other]) continue;
       const double cost = arrival(near, u, done.begin(), rate[other], edges, other);
       if (cost >= u[other]) continue;
       u[other] = cost;

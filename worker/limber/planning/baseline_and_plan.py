@@ -142,7 +142,9 @@ class _Search:
         self.best: GentlePath | None = None
         self.best_weight, self.value = np.nan, -np.inf
         self.levels: list[dict[str, float]] = []
-        self.low, self.high = 0.0, np.inf
+        self.binds = False
+        self.low: tuple[float, float, float] | None = None  # weight, length and integral
+        self.high: tuple[float, float, float] | None = None
 
     def begin(self, others: list[np.ndarray]) -> None:
         """Find the gentlest path from those known, and the saving per additional metre. NoPathError
@@ -160,7 +162,9 @@ class _Search:
                               "Sample more poses with ", Command("energy", Option("samples")), ".")
         for path in free:
             self._note(_LIGHT, *_measured(path, self.problem))
-        if self.length < _BINDS * self.longest:
+        gentlest = min(self.curve, key=lambda point: point.energy_integral_jm)
+        self.binds = max(self.length / _BINDS, gentlest.length_m) >= self.longest
+        if not self.binds:
             return
         for share in _SHORTER:
             path, cost = refine(self.path, replace(light, longest=share * self.longest))
@@ -207,18 +211,21 @@ class _Search:
         if found.certificate.stopped or self.integral <= (1.0 + _ENOUGH) * self.value:
             return None
         metre, energy = weight * self._metre, self.problem.weights.energy
-        length, _ = _measured(found.points, self.problem)
+        length, integral = _measured(found.points, self.problem)
         spare = metre * (self.longest - length)
         uncertainty = (found.cost - found.certificate.lower) / energy
-        if spare < uncertainty and self.length >= _BINDS * self.longest:
-            self.low = weight
-        elif spare > uncertainty:
-            self.high = weight
+        if spare > uncertainty:
+            self.high = weight, length, integral
+        elif self.binds:
+            self.low = weight, length, integral
         else:
             return None
-        if self.low > 0.0 and self.high < np.inf:
-            return float(np.sqrt(self.low * self.high))
-        return weight * _STRIDE if self.low > 0.0 else weight / _STRIDE
+        if self.low is None or self.high is None:
+            return weight * _STRIDE if self.high is None else weight / _STRIDE
+        # Between the two paths, the best weight is what a metre saves from one to the other.
+        (low, longer, less), (high, shorter, more) = self.low, self.high
+        saved = (more - less) / max(longer - shorter, 1e-12) / self._metre
+        return saved if low < saved < high else float(np.sqrt(low * high))
 
     def _enough(self, weight: float) -> float:
         """Return the gap of the weighted cost with which the energy, a part of it, has its own."""

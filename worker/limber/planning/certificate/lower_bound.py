@@ -12,7 +12,7 @@ proves that no path exists.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import NamedTuple
 
@@ -26,7 +26,6 @@ from limber.planning.certificate.subsolution import (
     CURVATURE_FACTOR,
     RIM,
     Terrain,
-    around_box,
     corner_values,
     corners_of,
     least_between,
@@ -179,71 +178,81 @@ def descent(grid: Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
 
 # Goal data on the cells of a grid: its position and the cost from there to it.
 
+# A path may also end where the goal meets the border of trust. A target's distance often grows
+# mostly across that border, so beyond it a cell would seem to be in the goal, and a path to be
+# short. Poses of the goal have a distance d <= 0 and a height h <= 0 above the border, so also
+# d + k h <= 0 for any k >= 0, which may differ from place to place. The k that divides to the most,
+# (d + k h) / |grad d + k grad h|, gives the distance to both together, as far as they are flat.
+
 _BEYOND = 1.2  # factor on the steepest measured growth of the goal's distance
 _FLAT = 0.5  # least fraction of that growth that its mean counts as
+_ALONG = 0.05  # least fraction of that growth that counts as along the border
+_FLATTENED = 2.0  # diagonals of a cell over which the cost flattens out inside the goal
 
 
 @dataclass(frozen=True)
 class AboutGoal:
-    """A signed cost to the goal, negative inside, where ``known``: each point of the goal is in a
-    cell with all coefficients there, ``inside`` or at the ``border``. ``meets``: an open cell may
-    have a point of the goal. ``near``: the next grid's queried cells."""
+    """A signed cost to the goal, negative ``inside``, where ``known``: each point of the goal is in
+    a cell with all coefficients there, and a spline with no larger ones is at most 0 at it.
+    ``meets``: an open cell may have a point of the goal. ``near``: the next grid's queried cells.
+    """
 
     known: np.ndarray
     cost: np.ndarray
     inside: np.ndarray
-    border: np.ndarray
     meets: bool
     near: np.ndarray
-
-    def slack(self, costs: np.ndarray) -> float:
-        """Return the largest value in the goal of a spline with ``costs`` as coefficients: it
-        differs from a function that they sample by ``h^2 / 8 sum_i max |second derivative|``."""
-        if not self.border.any():
-            return 0.0
-        # A cell's neighbours count, and their second differences reach one cell farther.
-        box = around_box(self.border, 2)
-        curved = sum(scipy.ndimage.maximum_filter(second, 3) for second in second_differences(
-            np.where(self.known[box] & (costs[box] < np.inf), costs[box], np.nan)))
-        return CURVATURE_FACTOR / 8.0 * float(curved[self.border[box]].max())
 
 
 def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal:
     """Return the goal data."""
     edges, shape = ground.edges, ground.open_cells.shape
-    cells = np.argwhere(ground.active & grid.about_goal)
-    nothing = np.zeros(shape, bool)
+    cells, nothing = np.argwhere(ground.active & grid.about_goal), np.zeros(shape, bool)
     if len(cells) == 0:
-        return AboutGoal(nothing, np.zeros(shape), nothing, nothing, False, nothing)
-    goal = problem.bounded_goal
-    away = goal.excess(problem.energy_field, grid.points(cells + 0.5))
+        return AboutGoal(nothing, np.zeros(shape), nothing, False, nothing)
+    goal, region = problem.bounded_goal, problem.energy_field.region
+    centres = grid.points(cells + 0.5)
     # In the bounding box of these cells only, with a margin layer of unknown values.
     low, high = np.maximum(cells.min(axis=0) - 1, 0), cells.max(axis=0) + 2
     box = tuple(map(slice, low, high))
     open_cells = ground.open_cells[box]
-    distance = spread(open_cells.shape, cells - low, away)
-    filled = np.nan_to_num(distance, nan=np.inf)
-    reach, slope, is_exact = _growth(distance, edges)
-    corners = tuple(map(slice, low, high + 1))
-    rate = np.where(ground.level[box], ground.floor,
-                    corner_values(ground.rate[corners]).mean(axis=0))
-    cost = _cost_left(distance / slope, goal.tolerance / slope, rate, edges)
-    touching = open_cells & (filled <= reach)
-    inside = filled < -reach
+    height, outward = region.height_and_slope(centres)
+    alone, height, outward = (spread(open_cells.shape, cells - low, values) for values in (
+        goal.excess(problem.energy_field, centres), height, outward @ grid.axes.T))
+    distance, slope = _with_border(alone, height, outward, edges)
+    filled, reach = np.nan_to_num(distance, nan=np.inf), _reach(distance, edges)
+    # Where the border's plane changes, the distance to both jumps, but not the goal's alone.
+    meets = (filled <= reach) & (np.nan_to_num(alone, nan=np.inf) <= _reach(alone, edges))
+    touching, inside = open_cells & meets, filled < -reach
+    rate = np.where(ground.level[box], ground.floor, corner_values(
+        ground.rate[tuple(map(slice, low, high + 1))]).mean(axis=0))
+    deep = np.minimum(goal.tolerance / slope, _FLATTENED * float(np.linalg.norm(edges)))
+    cost = _cost_left(distance, deep, rate, edges)
 
     def whole(part: np.ndarray) -> np.ndarray:
         out = np.zeros(shape, part.dtype)
         out[box] = part
         return out
-    # A grasp's distance is exact, and used farther than the next cells. A target's is not: where
-    # the target moves far with the grasp, cells far from the goal would count as near it.
     # Cells next to closed ones count too: from a deep one left out, a cost below 0 would spread.
-    known = filled <= 3.0 * reach if is_exact else (
-        scipy.ndimage.binary_dilation(filled <= reach, _NEAR) & np.isfinite(distance))
+    known = scipy.ndimage.binary_dilation(meets, _NEAR) & np.isfinite(distance)
+    cost -= _bent_up(cost, touching & ~inside)
     # A cell of the next grid queries up to 4 of its edges away; its centre is in this one.
-    return AboutGoal(whole(known), whole(np.nan_to_num(cost)),
-                     whole(inside), whole(touching & ~inside), bool(touching.any()),
+    return AboutGoal(whole(known), whole(np.nan_to_num(cost)), whole(inside), bool(touching.any()),
                      whole(filled <= 9.0 * reach))
+
+
+def _bent_up(cost: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """Return what to take off a cost (nan: not known) so that a spline with it as coefficients is
+    nowhere in the cells of the ``border`` above the cost.
+
+    The spline at a point is a mean of the coefficients of the cells next to its own, and differs
+    from the cost there by at most ``h^2 / 8 sum_i max |second derivative|``. So as much comes off
+    all of them, and evenly beyond.
+    """
+    # A cell's neighbours count as well.
+    curved = sum(scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
+    above = np.where(border, CURVATURE_FACTOR / 8.0 * curved, 0.0)
+    return scipy.ndimage.uniform_filter(scipy.ndimage.maximum_filter(above, 7), 3)
 
 
 def short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,
@@ -276,30 +285,54 @@ def _cost_left(length: np.ndarray, depth: np.ndarray, rate: np.ndarray, edges: n
     return flat * np.where(length > 0.0, np.clip(mid_rate, 0.5 * rate, 1.5 * rate), rate)
 
 
-def _growth(distance: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-    """By how much the goal's distance grows from a cell's centre to its corners at most, a smooth
-    mean of its growth per metre to divide by, and whether it is exact. The mean needs no reserve:
-    the sub-solution is scaled down wherever it is too steep."""
+def _with_border(distance: np.ndarray, height: np.ndarray, outward: np.ndarray,
+                 edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far a path must go at least to the goal within the border of trust [m], from its
+    ``distance`` and the ``height`` above the border, which grows by ``outward`` [..., 3], and by
+    how much the distance grows per metre. The growth needs no reserve: the sub-solution is scaled
+    down wherever it is too steep."""
+    ahead_or_behind = _differences(distance, edges)
+    known = np.isfinite(ahead_or_behind)
+    steepest = np.abs(np.nan_to_num(ahead_or_behind)).max(axis=0)
+    if steepest.max() <= 1.0 + 1e-9:  # a grasp's, which grows as little across the border as along
+        return distance, np.ones_like(distance)
+    mean = np.nan_to_num(ahead_or_behind).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    weight = known.any(axis=(0, 1)).astype(float)
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        return scipy.ndimage.uniform_filter(values * weight, 3) / np.maximum(
+            scipy.ndimage.uniform_filter(weight, 3), 1e-9)
+    slope = np.maximum(smooth(np.linalg.norm(mean, axis=0)), _FLAT * scipy.ndimage.maximum_filter(
+        np.linalg.norm(steepest, axis=0), 3)) + 1e-12
+    up = np.maximum((outward**2).sum(axis=-1), 1e-12)
+    growth = np.stack([smooth(one) for one in mean], axis=-1)
+    most = np.maximum(-(growth * outward).sum(axis=-1) / up, 0.0)
+    along = np.maximum(((growth + most[..., None] * outward)**2).sum(axis=-1), (_ALONG * slope)**2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        best = np.nan_to_num(most + along * height / up / (distance + most * height))
+    found = distance / slope
+    for factor in (np.clip(best, 0.0, most), most):
+        found = np.maximum(found, (distance + factor * height) / np.sqrt(
+            along + (most - factor)**2 * up))
+    return found, slope
+
+
+def _reach(distance: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return by how much the goal's distance grows from a cell's centre to its corners at most.
+    Across the surface it grows most, and there a cell is thin."""
+    steepest = np.abs(np.nan_to_num(_differences(distance, edges))).max(axis=0)
+    return _BEYOND * scipy.ndimage.maximum_filter(0.5 * np.einsum("i,i...", edges, steepest), 3)
+
+
+def _differences(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the growth per metre to the next cells and from those before, [2, 3, ...]."""
     ahead, behind = [], []
     for axis, edge in enumerate(edges):
-        unknown = np.full_like(distance.take([0], axis), np.nan)
-        step = np.diff(distance, axis=axis) / edge
+        unknown = np.full_like(values.take([0], axis), np.nan)
+        step = np.diff(values, axis=axis) / edge
         ahead.append(np.concatenate([step, unknown], axis))
         behind.append(np.concatenate([unknown, step], axis))
-    either = np.nan_to_num(np.stack([ahead, behind]))
-    known = np.isfinite([ahead, behind])
-    steepest = np.abs(either).max(axis=0)
-    if steepest.max() <= 1.0 + 1e-9:  # a grasp's distance: by at most a metre per metre
-        return (np.full_like(distance, 0.5 * np.linalg.norm(edges)), np.ones_like(distance), True)
-    # A target's by the field's rate, and a reserve. Across the surface it grows most, and there a
-    # cell is thin.
-    reach = scipy.ndimage.maximum_filter(0.5 * np.einsum("i,i...", edges, steepest), 3)
-    growth = scipy.ndimage.maximum_filter(np.linalg.norm(steepest, axis=0), 3)
-    mean = np.linalg.norm(either.sum(axis=0) / np.maximum(known.sum(axis=0), 1), axis=0)
-    weight = known.any(axis=(0, 1)).astype(float)
-    smooth = scipy.ndimage.uniform_filter(mean * weight, 3) / np.maximum(
-        scipy.ndimage.uniform_filter(weight, 3), 1e-9)
-    return _BEYOND * reach, np.maximum(smooth, _FLAT * growth) + 1e-12, False
+    return np.array([ahead, behind])
 
 
 _MOST_CELLS = 400_000  # in any grid's tube; a further refinement is skipped
@@ -485,7 +518,6 @@ class _Bounds:
     rates: Terrain
     to_goal: np.ndarray
     cell: np.ndarray
-    slack: float
     rough_path: np.ndarray
     about_goal: np.ndarray
 
@@ -500,14 +532,14 @@ class _Bounds:
         box = tuple(map(slice, low, high))
         has_cost = np.isfinite(self.to_goal[box])
         known = self.open_cells[box] & scipy.ndimage.binary_erosion(has_cost, _NEAR)
-        costs = np.where(has_cost, self.to_goal[box] - self.slack, np.nan).astype(np.float32)
+        costs = np.where(has_cost, self.to_goal[box], np.nan).astype(np.float32)
         return BoundGrid(grid.points(low[None])[0], grid.edges, costs, known)
 
     def keep(self, upper: float) -> np.ndarray:
         """Return the cells through which a path could still be cheaper than ``upper``."""
         through = least_in_cells(self.to_goal + _from_start(self.rates, self.cell),
                                  self.open_cells)
-        return self.open_cells & np.isfinite(through) & (through - self.slack <= upper)
+        return self.open_cells & np.isfinite(through) & (through <= upper)
 
 
 class _FieldOnGrid(NamedTuple):
@@ -562,10 +594,8 @@ def _bound(problem: GentleProblem, on_grid: _FieldOnGrid, grid: Grid, cell: np.n
         rates = rates._replace(
             open_cells=short_enough(problem, grid, rates.open_cells, goal.near, cell))
     to_goal = subsolution(rates, goal.known, goal.cost, goal.inside)
-    slack = replace(goal, border=goal.border & rates.open_cells).slack(to_goal)
-    lower = spline_value(to_goal, cell) - slack
-    return _Bounds(max(lower, 0.0), rates, to_goal, cell, slack, descent(grid, to_goal, cell),
-                   goal.near)
+    return _Bounds(max(spline_value(to_goal, cell), 0.0), rates, to_goal, cell,
+                   descent(grid, to_goal, cell), goal.near)
 
 
 def _from_start(rates: Terrain, cell: np.ndarray) -> np.ndarray:
@@ -576,7 +606,8 @@ def _from_start(rates: Terrain, cell: np.ndarray) -> np.ndarray:
     away = np.sqrt(sum(offset**2 for offset in offsets))
     rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a rounded tip, without a kink
     nothing = np.zeros(rates.open_cells.shape, bool)
-    u = subsolution(rates, away <= 3.0 * h, rounded, nothing, rounds=2)
+    per_metre = rates.rate[tuple(slice(k, k + 2) for k in cell)].mean()
+    u = subsolution(rates, away <= 3.0 * h, per_metre * rounded, nothing, rounds=2)
     return u - spline_value(u, cell)
 
 

@@ -74,8 +74,8 @@ def march(rate: np.ndarray, near: np.ndarray, known: np.ndarray, values: np.ndar
     possible (Sethian 1999, "Fast marching methods", SIAM Review 41, sections 5 and 6).
 
     Return arrival costs [n], infinite where unreachable, from cost per metre [n], neighbours [n,
-    6], values [n] at ``known`` nodes, and the grid's edges [3] [m]. They are only a candidate: the
-    subsolution below checks what a proof needs, however the candidate was found.
+    6], values [n] that ``known`` nodes have at most, and the grid's edges [3] [m]. They are only a
+    candidate: the subsolution below checks what a proof needs, however the candidate was found.
     """
     out = np.empty(len(rate))
     _marched(rate, near, known, values, edges, out)
@@ -211,30 +211,18 @@ def corner_values(values: np.ndarray) -> np.ndarray:
 
 def corners_of(cells: np.ndarray) -> np.ndarray:
     """Return the nodes [nx + 1, ny + 1, nz + 1] that are corners of any of ``cells``."""
-    nodes = np.zeros(tuple(n + 1 for n in cells.shape), bool)
-    nx, ny, nz = cells.shape
-    for i in (0, 1):
-        for j in (0, 1):
-            for k in (0, 1):
-                nodes[i:nx + i, j:ny + j, k:nz + k] |= cells
-    return nodes
+    return with_corner(np.pad(cells, 1))
 
 
 def with_corner(nodes: np.ndarray) -> np.ndarray:
     """Return the cells of which a corner is one of ``nodes`` [nx + 1, ny + 1, nz + 1]."""
-    cells = np.zeros(tuple(n - 1 for n in nodes.shape), bool)
-    nx, ny, nz = cells.shape
-    for i in (0, 1):
-        for j in (0, 1):
-            for k in (0, 1):
-                cells |= nodes[i:nx + i, j:ny + j, k:nz + k]
-    return cells
+    return corner_values(nodes).any(axis=0)
 
 
 def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells: np.ndarray,
                 rounds: int = _ROUNDS) -> np.ndarray:
     """Return coefficients of a ``u`` with |grad u| <= c in every open cell but ``free_cells``; on
-    ``known`` nearly ``shape``, a signed cost, less where that is too steep; infinite where
+    ``known`` at most ``shape``, a signed cost, less where that is too steep; infinite where
     unreachable. Fewer local reweightings give a lower ``u``, never an invalid one."""
     active = rates.active
     around = known & active
@@ -246,20 +234,16 @@ def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells
     u[around] = shape[around]
     asked = np.argwhere(rates.open_cells & ~free_cells)
     own = numbers[tuple(asked.T)]
-    held, about = around.ravel()[indices], widened(around).ravel()[indices]
-    beside = asked[around[tuple(asked.T)]]
-    # Where the cost is too steep it counts less there alone: one factor for all would be the least.
+    # Where the cost is too steep it is lowered evenly: cell by cell, it would bend more.
+    beside, within = asked[around[tuple(asked.T)]], around_box(around)
     steep = np.ones(active.shape)
     steep[tuple(beside.T)] = np.maximum(_excess(u, rates, beside), 1.0)
-    within = around_box(around)
-    u[within] /= scipy.ndimage.uniform_filter(
-        scipy.ndimage.maximum_filter(steep[within], _EVEN), _EVEN)
-    lengths, most = u.ravel()[indices], float(_excess(u, rates, beside).max(initial=0.0))
-    factor = 1.0 / most if most > 0.0 else float(bound[held].min())
-    rate, steepest = bound, held
-    least, best, idle = np.inf, bound, 0
+    u[within] = np.minimum(u[within], u[within] / scipy.ndimage.uniform_filter(
+        scipy.ndimage.maximum_filter(steep[within], _EVEN), _EVEN))
+    held, lengths = around.ravel()[indices], u.ravel()[indices]
+    rate, least, best, idle = bound, np.inf, bound, 0
     for _ in range(rounds):
-        values = march(rate, near, held, factor * lengths, rates.edges)
+        values = march(rate, near, held, lengths, rates.edges)
         u.ravel()[indices] = values
         over = np.ones(len(indices))
         over[own] = np.maximum(_excess(u, rates, asked), 1.0)
@@ -269,8 +253,6 @@ def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells
             least, best = worst, values
         if worst <= _CLOSE or idle == _IDLE:
             break
-        factor /= float(over[steepest].max())
-        steepest = about
         # The largest of the neighbours: cell by cell would cause a chequerboard pattern.
         rate = rate / _most_about(over, numbers, indices)
     # The rescaling makes it a proof; the rounds before only keep it small.
