@@ -122,7 +122,7 @@ class _Search:
                 squares = 2 * OUTLYING**2 * (np.sqrt(1 + squares / OUTLYING**2) - 1)
             return 0.5 * float(squares @ self._own_weights(found)**2)
 
-        damping = 0.0
+        damping = least = 0.0
         for _ in range(self._limit):
             weight = self._own_weights(at)
             if robust:
@@ -137,8 +137,9 @@ class _Search:
             step *= min(1.0, LONGEST_STEP / max(longest, 1e-12))
             tried = self._objective.evaluate(at.free + step, jacobian=True)
             fall = -np.inf if tried is None else cost(at) - cost(tried)
-            linear = residual + slopes @ step
-            foreseen = 0.5 * float(residual @ residual - linear @ linear)
+            # Where full steps lead out of equilibrium, the next one would too.
+            least = FIRST_DAMPING / 8 if tried is None else least
+            foreseen = 0.5 * float(residual @ residual - np.sum((residual + slopes @ step)**2))
             if tried is None or fall <= 0:
                 # Too little was to be gained.
                 if damping > MOST_DAMPING or (tried is not None and foreseen < max(
@@ -146,7 +147,7 @@ class _Search:
                     return Fit(at, FitStatus.converged, "No step descends.")
                 damping = max(FIRST_DAMPING, 8 * damping)
                 continue
-            damping = 0.0 if damping < FIRST_DAMPING else (
+            damping = least if damping < FIRST_DAMPING else (
                 damping / 8 if fall > 0.25 * foreseen else 2 * damping)
             was, at = cost(at), tried
             if fall < ending * was:
