@@ -156,11 +156,9 @@ def find_leaves(points: np.ndarray, odds: np.ndarray | None = None) -> list[Leaf
 
 def leaf_evidence(points: np.ndarray) -> np.ndarray:
     """What each point's surroundings add to the logarithm of the odds that a scan shows leaves,
-    shape [n]: over 0 if it is likelier on one. Neighbours share theirs, which count once."""
-    own = OwnFrame.of(points)
-    spacing, odds = point_spacing(own.coordinates), np.full(len(points), _trees()["shape_start"])
-    if len(points) >= _SMALLEST and spacing > 0:
-        odds[own.order] = voted(surroundings(own.coordinates, spacing), "shape")
+    shape [n]: over 0 if it is likelier on one than before looking. Neighbours share theirs, which
+    count once."""
+    odds = leaf_log_odds(points) - _trees()["context_start"]
     return np.clip(odds, -_MOST_ODDS, _MOST_ODDS) / ALIKE
 
 
