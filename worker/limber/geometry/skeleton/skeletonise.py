@@ -138,8 +138,7 @@ class _Search:
 
         if lead(scan) > 0 and (seen := scan.where_seen(wood)).score(wood) > scan.score(wood):
             scan = seen
-        # As in the shape, neighbours count once where they speak for wood.
-        return best if max(lead(scan), lead(scan) / ALIKE) + shape > 0 else None
+        return best if lead(scan) / ALIKE + shape > 0 else None  # neighbours count once
 
     def _joining(self) -> dict[str, Any]:
         settings = self.settings
