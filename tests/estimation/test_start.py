@@ -260,6 +260,7 @@ def test_twigs_that_no_pull_reaches_are_rigid(twiggy):
     assert light == pytest.approx(heavy, rel=1e-3, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_branch_that_barely_stands_starts_from_its_moduli(twiggy):
     """Its weight bends it as much as the gripper does: where it was seen, not where a rod of any
     modulus would take it. Lumped twigs weigh on it too."""

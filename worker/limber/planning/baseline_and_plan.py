@@ -512,8 +512,9 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | 
             "D-RRT* cannot limit the length of its path.", "Omit ", Option("planner"), ".")
     rough = known or [plan_gentle(problem, progress=progress.part(0.0, 0.3)).points]
     paths = [_shortest(problem, path) for path in rough]
-    shortest = min((path for path in paths if np.isfinite(path.cost)),
-                   key=lambda path: path.cost).points
+    # Near a limit none of them may be free, but those that they began from are.
+    shortest = min([path.points for path in paths if np.isfinite(path.cost)] or rough,
+                   key=lambda points: arc_lengths(points)[-1])
     length = float(arc_lengths(shortest)[-1])
     if tree is not None:  # as long as it is reported
         length = max(length, float(arc_lengths(resample(tree, STEP))[-1]))

@@ -174,8 +174,8 @@ def load_branch(branch: Branch, *, gravity: bool = True, loaded: bool = False,
 def warn_of_assumed_young(branch: Branch, young: np.ndarray, progress: Progress) -> None:
     """Warn if Young's modulus in the mesh [Pa] is neither estimated nor stated."""
     made_by = branch.manifest.files["mesh.vtu"].stage
-    if made_by in ("reconstruct", "mesh") and branch.manifest.stages[made_by].settings.get(
-            "young", young) is None:
+    made = branch.manifest.stages.get(made_by)
+    if made_by in ("reconstruct", "mesh") and made and made.settings.get("young", young) is None:
         progress.warn(Text(
             f"Young's modulus is not known: {np.median(young):.2g} Pa is assumed, and forces, "
             "energies and strains are as uncertain as that. Estimate it (", Command("estimate"),
