@@ -62,7 +62,7 @@ from limber.geometry.skeleton.skeleton import (
     Skeleton,
     upright_rotation,
 )
-from limber.geometry.skeleton.skeletonise import Apart, skeletonise
+from limber.geometry.skeleton.skeletonise import SEARCHED, Apart, skeletonise
 from limber.geometry.surface.surface import Surface, check_surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets.tet_mesh import TetMesh, mark, measure_quality
@@ -194,7 +194,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
             if known is None else _found_before(prepared, known, progress))
     whole = found
     # The search of a thin scan has asked of each twig whether the sensor shows it.
-    if wood.view is not None and own is None and found.length_spread is None:
+    if wood.view is not None and own is None and len(wood.cloud) > SEARCHED:
         found, text = seen_skeleton(found, wood)
         if text:
             progress.warn(text)

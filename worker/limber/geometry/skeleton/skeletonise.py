@@ -36,6 +36,8 @@ from limber.geometry.skeleton.tree_likelihood import PointLikelihood
 Apart = Callable[[np.ndarray], None]
 """Receives which points of a cloud belong to another plant or cluster, shape [n]."""
 
+SEARCHED = 1_500
+"""Most points of a scan whose likeliest tree is searched: a limit of time."""
 FIT_POINT_LIMIT = 30_000
 """More points do not improve the fit; they only slow it down."""
 _BRIDGE_LIMIT = 0.15  # longest bridge over a gap, as a fraction of the cloud's diagonal
@@ -46,7 +48,6 @@ _CONTRACTED_POINTS = 12_000  # more are thinned evenly: the fit, not contraction
 # twigs of a real branch of 784. Of 9,000 and 20,000 points contraction makes more false twigs, or
 # finds less.
 _FEW = 5_000
-_SEARCHED = 1_500  # most points of a scan whose likeliest tree is searched: a limit of time
 
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
@@ -125,7 +126,7 @@ class _Search:
         # camera's readings are flat where they graze wood.
         if fitted.view is not None:
             return None
-        some = fitted.points[::len(fitted.points) // _SEARCHED + 1]
+        some = fitted.points[::len(fitted.points) // SEARCHED + 1]
         scan, shape, rivals = PointLikelihood.of(some), float(leaf_evidence(some).sum()), [first]
         if shape > 0:
             rivals.append(self.pruned(*self.in_levels(fitted.points, graph.nodes[start], float(
@@ -175,7 +176,7 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
                       progress.part(0.65, 0.95))
     wood, (skeleton, unlikely) = fitted.skeleton, likely(fitted.skeleton, twig_probability)
     noise, count, spread = fitted.noise, pruned, None
-    if len(points) <= _SEARCHED:
+    if len(points) <= SEARCHED:
         wood, noise, count, spread = rival_tree(skeleton, some, view, progress.part(0.95, 1.0))
         skeleton, unlikely = wood, []
     segment, residual = nearest_cylinders(wood, points)
