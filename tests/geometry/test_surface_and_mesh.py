@@ -210,10 +210,11 @@ def test_tetwild_fills_a_branch_and_is_cached(y_skeleton, tmp_path, monkeypatch)
     """fTetWild keeps the volume, comes out oriented, and the second time from the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     surface = branch_surface(y_skeleton, sides=6, spacing=4)
-    mesh, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, time_limit=120)
+    # It inserts triangles in an order from the machine's entropy: 25 meshes have .992 to .999.
+    mesh, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.001, time_limit=120)
     assert not cached and mesh.volumes.min() > 0
     assert mesh.volumes.sum() == pytest.approx(surface.volume, rel=0.03)
-    again, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, time_limit=120)
+    again, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.001, time_limit=120)
     assert cached
     np.testing.assert_array_equal(mesh.nodes, again.nodes)
 
