@@ -30,6 +30,9 @@ def test_entries_are_checked_by_name(tmp_path, plain_pull):
     path.write_text(text.replace('mode = "rigid"', 'mode = "glued"'))
     with pytest.raises(InputError, match=r"grasp\.mode"):
         read_entry(path)
+    for support, mode in (("clamped", "rigid"), ("pinned", "point")):  # words of beam theory
+        path.write_text(text.replace('mode = "rigid"', f'mode = "{support}"'))
+        assert read_entry(path).grasp.mode == mode
     path.write_text(text + "\nunknown = 3\n")
     with pytest.raises(InputError, match="unknown"):
         read_entry(path)

@@ -514,7 +514,7 @@ class Branch:
         """Start a process in which the branch follows its grasps, many times a second.
 
         Args:
-            mode: Mode of the marked grasp: ``clamped`` (the pose is held) or ``pinned`` (the
+            mode: Mode of the marked grasp: ``rigid`` (the pose is held) or ``point`` (the
             position).
             settings: Fields of :class:`limber.session.protocol.SessionSettings`.
 

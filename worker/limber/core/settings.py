@@ -17,6 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     ValidationError,
     ValidationInfo,
@@ -126,8 +127,10 @@ class OneOf:
         return name
 
 
-GraspMode = Literal["rigid", "point"]
-"""Rigid: position and rotation of a piece are held; point: only its mean position."""
+GraspMode = Annotated[Literal["rigid", "point"], BeforeValidator(
+    lambda mode: {"clamped": "rigid", "pinned": "point"}.get(str(mode), mode))]
+"""Rigid (clamped): position and rotation of a piece are held; point (pinned): only its mean
+position."""
 
 Groups = dict[str, tuple[str, ...]]
 """Titles, each with the names of the fields below it."""

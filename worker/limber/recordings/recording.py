@@ -17,7 +17,7 @@ from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.reading import checked_as, read_toml, toml_content
 from limber.core.json_values import first_refusal, plain, validated
 from limber.core.numerics.rigid import rotation_matrix
-from limber.core.settings import possible_time
+from limber.core.settings import GraspMode, possible_time
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.recordings.time_series import Stream, read_stream, write_stream
@@ -117,7 +117,7 @@ class GraspEntry(BaseModel):
     radius_m: float = Field(
         gt=0, description="Nodes within this distance are held. A clamped grasp holds the branch "
         "over this length to both sides along its axis.")
-    mode: Literal["rigid", "point"] = "rigid"
+    mode: GraspMode = "rigid"
 
 
 class SensorEntry(BaseModel):

@@ -32,7 +32,7 @@ class InteractiveSession:
 
     Args:
         branch_folder: The branch.
-        mode: Mode of the marked grasp, which is held at the start: ``clamped`` or ``pinned``.
+        mode: Mode of the marked grasp, which is held at the start: ``rigid`` or ``point``.
         settings: Further fields of :class:`limber.session.protocol.SessionSettings`.
         start_seconds: Longest duration of the start.
 

@@ -126,7 +126,7 @@ class FitVibration(KeptStage, BranchStage):
                                  "No branch swings like that. Its times are in another unit.",
                                  "Name the unit in the title of the times: t_s, t_ms or t_us.")
             progress(0.3, "modulus of that frequency")
-            model = load_branch(branch, progress=progress).model
+            model = load_branch(branch, young=mesh.cell_data.get("young"), progress=progress).model
             fitted = young_of(_with_sensor(model, self), seen, density_sigma(branch))
             young = fitted["young_factor"] * model.young
             result = _summary(seen, fitted, float(young.mean()))
