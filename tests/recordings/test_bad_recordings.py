@@ -462,3 +462,9 @@ def test_points_beside_a_branch_are_not_said_to_be_millimetres():
     nodes = np.column_stack([np.zeros(50), np.zeros(50), np.linspace(0, 0.4, 50)])
     assert "millimetres" not in likely_slip(np.array([[0.3, 0.0, 0.2]]), nodes, Alignment(), 0.1)
     assert "millimetres" in likely_slip(np.array([[10.0, 0.0, 300.0]]), nodes, Alignment(), 0.1)
+
+
+def test_a_point_of_another_branch_is_not_said_to_have_other_axes():
+    """Of 47 turns some bring it near."""
+    nodes = np.linspace([0.0, 0.1, 0.0], [0.05, 0.1, 0.8], 200)
+    assert not likely_slip(np.array([[0.3, 0.2, 0.1]]), nodes, Alignment(), 0.25)

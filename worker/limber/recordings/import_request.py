@@ -403,8 +403,8 @@ def require_on_branch(grasp: GraspEntry, name: str, branch: BranchFrame) -> None
         point = ", ".join(f"{value:.4g}" for value in grasp.point_m)
         raise InputError(
             f"{name}: the grasp point ({point}) m is {off * 1e3:.0f} mm away from the branch.",
-            "The gripper would not hold the branch. The point, or the whole recording, has "
-            f"another frame of reference or unit. {slip}".rstrip(),
+            "The gripper would not hold the branch. The recording is of another branch, or it or "
+            f"the point has another frame of reference or unit. {slip}".rstrip(),
             "Give a ", Option("grasp_point"), " on the branch, in the frame set by ",
             Option("coordinates"), ", and check ", Option("unit"), ".").at(grasp.point_m)
 
@@ -422,7 +422,8 @@ def require_near(rest: np.ndarray, name: str, branch: BranchFrame, what: str = "
         raise InputError(
             f"{name}: at rest {what} is {off.max() * 1e3:.0f} mm away from the branch, which is "
             f"{extent * 1e3:.0f} mm long.",
-            f"The recording has another frame of reference or another unit. {slip}".rstrip(),
+            "The recording is of another branch, or has another frame of reference or unit. "
+            f"{slip}".rstrip(),
             *(("Give the markers' positions on the branch with ", Option("nominal"),
                ", or the pose of their frame with ", Option("marker_frame"))
               if what == "a marker" else

@@ -12,6 +12,7 @@ from itertools import permutations, product
 
 import numpy as np
 import scipy
+from scipy.spatial.transform import Rotation
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError, Option, Text
@@ -21,6 +22,8 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.recording import Pull, calibration_of
 from limber.recordings.sensor_checks import force_unit_suspicion
 
+_CHANCE = 0.05
+"""Probability with which the best of all axes may fit by chance, for them to be named."""
 _FASTEST_M_S, _LONGEST_S = 5.0, 3600.0
 """Of a robot's tool; of a pull."""
 _THOUSAND = (300.0, 3000.0)
@@ -89,10 +92,12 @@ AXES = {f"{a}{'xyz'[i]},{b}{'xyz'[j]},{c}{'xyz'[k]}": np.array(
 
 def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, near: float) -> str:
     """Return which slip explains points [m], shape [n, 3], farther than ``near`` [m] from the
-    branch's nodes [k, 3], as a sentence; "" if none does. ``alignment``: from the scan's
-    coordinates."""
+    branch's nodes [k, 3], as a sentence; "" if none does, or turned at random they come as near.
+    ``alignment``: from the scan's coordinates."""
+    nearest = scipy.spatial.cKDTree(nodes)
+
     def off(moved: np.ndarray) -> float:
-        return float(max(np.linalg.norm(nodes - point, axis=1).min() for point in moved))
+        return float(nearest.query(moved)[0].max())
 
     for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres")):
         # Nearer points would all fit at the root.
@@ -104,7 +109,9 @@ def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, nea
     name = min(away, key=lambda each: away[each])
     if off(alignment.apply_metres(points)) <= min(near, away[name]):
         return Text("They fit in the frame of the scan: state ", Option("coordinates", "scan"), ".")
-    if away[name] <= near:
+    turns = Rotation.from_quat(np.random.default_rng(0).standard_normal((1000, 4))).as_matrix()
+    share = np.mean([off(points @ turn.T) <= away[name] for turn in turns])
+    if away[name] <= near and 1 - (1 - share) ** len(away) < _CHANCE:
         if "-" in name:
             return f"They fit with other axes: x, y, z of the branch are {name} of the table."
         return ("They fit with the titles x, y, z exchanged: the columns titled x, y, z are "
