@@ -95,7 +95,9 @@ class PlanSettings(Settings):
     goal_seed: int | None = Field(None, ge=0, description=(
         "Seed of a random goal in the paper's hemisphere: above the base, within the branch's "
         "length, among sampled poses that are allowed and far from rest."))
-    goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
+    goal_tolerance: float = Field(
+        0.01, gt=0, le=1, description="Radius of the goal region [m]. Of a chosen goal at most a "
+        "quarter of the largest deflection.")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Start position of the grasp [m]. Default: the rest pose."),
                                                      json_schema_extra=POSITION)

@@ -76,12 +76,13 @@ _BEGINS = 0.6  # fraction of the tip's way to the default goal at which that rea
 def default_goal(field: EnergyField, tolerance: float) -> Goal:
     """Return a goal far from rest that needs no force: the sample of least energy among those over
     three quarters of the largest deflection, moved a little towards rest. Trust is a shell often
-    thinner than the tolerance: what counts is the part of the goal along it."""
+    thinner than the tolerance: what counts is the part of the goal along it. The tolerance [m] is
+    at most a quarter of that deflection, so that a seedling's goal does not contain its start."""
     chart = field.region.chart.plain
     samples = chart.map(field.samples.positions)
     rest = chart.map(field.rest)[0]
     away = np.linalg.norm(field.samples.positions - field.rest, axis=1)
-    far = np.flatnonzero(away >= 0.75 * away.max())
+    far, tolerance = np.flatnonzero(away >= 0.75 * away.max()), min(tolerance, away.max() / 4)
     around = ball(100, np.random.default_rng(0)) * tolerance
     if chart.radius > 0.0:
         around[:, 2] = 0.0
@@ -132,7 +133,7 @@ def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits:
                           f"A distant pose is at least {half:.3f} m from rest; the hemisphere's "
                           f"radius is {length:.3f} m.",
                           "Give a ", Option("goal"), ", or relax the limits.")
-    return grasp_goal(points[np.flatnonzero(fit)[0]], tolerance)
+    return grasp_goal(points[np.flatnonzero(fit)[0]], min(tolerance, half / 2))
 
 
 def _drawn(asked: GoalRequest, seed: int) -> Goal:
