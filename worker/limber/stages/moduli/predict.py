@@ -66,7 +66,7 @@ def _entry(branch: Branch, name: str | None) -> PullEntry:
 
     names = known_pulls(branch)
     if not names or (name is not None and name not in names):
-        raise InputError(f"{branch.folder} has no pull {name or ''}.",
+        raise InputError(f"{branch.folder} has no pull {name or 'yet'}.",
                          f"It has {', '.join(names)}." if names else "It has none.",
                          "Import one with ", Command("import-pull"), ".")
     return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))

@@ -141,8 +141,9 @@ def _pull(branch: Branch, name: str | None) -> Pull:
     if name is None and len(swings) == 1:
         name = swings[0]
     if name not in swings:
-        raise InputError(f"{branch.folder} has no swing {name or ''}.",
-                         f"It has {', '.join(swings)}." if swings else "It has none.", "Name one "
+        raise InputError("Which swing is not stated." if swings and name is None else
+                         f"{branch.folder} has no swing {name or 'yet'}.",
+                         f"It has {', '.join(swings) or 'none'}.", "Name one "
                          "with ", Option("pull"), ", or import one with ",
                          Command("import-pull", Option("motion", "swing"), Option("weight")), ".")
     pull = read_pull(branch.path(f"pulls/{name}"))
