@@ -236,9 +236,10 @@ class DoubtfulKind(StrEnum):
 
 @dataclass(frozen=True)
 class DoubtfulPart:
-    """An uncertain part, ``at`` [3], with length (0: a node) and median radius [m]. ``value`` is
-    the probability of a branch, attachment or root, a radius's deviation over it, the factor of a
-    jump outwards, the angle of a kink [rad], or NaN for a gap."""
+    """An uncertain part, ``at`` [3], with length (0: a node) and median radius [m]. An unlikely
+    branch is what would be deleted at its place. ``value`` is the probability of a branch,
+    attachment or root, a radius's deviation over it, the factor of a jump outwards, the angle of a
+    kink [rad], or NaN for a gap."""
 
     kind: DoubtfulKind
     branch: int
@@ -253,9 +254,10 @@ def doubtful_parts(skeleton: Skeleton) -> list[DoubtfulPart]:
     found: list[DoubtfulPart] = []
     for run, (members, own) in enumerate(
             zip(skeleton.runs(), skeleton.own_runs(), strict=True)):
-        probability = float(skeleton.probability[own].min())
-        if probability < _LIKELY:
-            found.append(_part(skeleton, DoubtfulKind.unlikely, run, own, probability))
+        there = skeleton.probability[own]
+        if there.min() < _LIKELY:
+            outer = own[np.argmax(there < _LIKELY):]
+            found.append(_part(skeleton, DoubtfulKind.unlikely, run, outer, float(there.min())))
         share = skeleton.radius_sigma / np.maximum(skeleton.radius, 1e-300)
         # Limited: points show more than wood has there, as a bunch of twigs or two limbs in one.
         for state, kind in ((UNRESOLVED, DoubtfulKind.unresolved),
@@ -278,16 +280,14 @@ def doubtful_parts(skeleton: Skeleton) -> list[DoubtfulPart]:
         if back > _BACKWARDS:
             found.append(_part(skeleton, DoubtfulKind.backwards, run, own[:1], back))
     order = list(DoubtfulKind)
-    return sorted(
-        found, key=lambda uncertain_part: (order.index(uncertain_part.kind), -uncertain_part.length)
-    )
+    return sorted(found, key=lambda part: (order.index(part.kind), -part.length))
 
 
-def _part(
-    skeleton: Skeleton, kind: DoubtfulKind, run: int, nodes: np.ndarray, value: float
-) -> DoubtfulPart:
+def _part(skeleton: Skeleton, kind: DoubtfulKind, run: int, nodes: np.ndarray,
+          value: float) -> DoubtfulPart:
     length = float(skeleton.steps[nodes].sum()) if len(nodes) > 1 else 0.0
-    return DoubtfulPart(kind, run, skeleton.nodes[nodes[len(nodes) // 2]], length,
+    place = nodes[0 if kind is DoubtfulKind.unlikely else len(nodes) // 2]
+    return DoubtfulPart(kind, run, skeleton.nodes[place], length,
                         float(np.median(skeleton.radius[nodes])), value)
 
 
