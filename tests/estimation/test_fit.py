@@ -7,19 +7,16 @@ import pytest
 from tests.subjects.forced_pulls import residual_slopes
 
 from benchmarks.paper_branches import Bench, measured
-from limber.core.errors import Cancelled, InputError
+from limber.core.errors import Cancelled, InputError, WorkError
 from limber.core.progress import Progress
 from limber.estimation.estimated_branch import require_scale_in_principle
+from limber.estimation.fitting import objective as objective_module
 from limber.estimation.fitting.objective import EvaluationLog, Objective, Stopped
-from limber.estimation.fitting.optimise import best_so_far, gauss_newton, nelder_mead
+from limber.estimation.fitting.optimise import FitStatus, best_so_far, gauss_newton, nelder_mead
 from limber.estimation.parameters import LINK_DEVIATION
 from limber.estimation.settings import FitSpec
+from limber.estimation.uncertainty import identifiability as identify
 from limber.estimation.uncertainty.covariance import uncertainty
-from limber.estimation.uncertainty.identifiability import (
-    identifiability,
-    link_unresolved,
-    require_scale,
-)
 from limber.recordings.recording import Observations
 
 SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=5)
@@ -116,10 +113,10 @@ def test_positions_alone_are_refused(small_bench, noisy):
     with pytest.raises(InputError, match="soft or stiff"):
         require_scale_in_principle(objective.forwards)
     evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
-    judged = identifiability(evaluation, objective.space)
+    judged = identify.identifiability(evaluation, objective.space)
     assert judged.singular_values[-1] < 1e-6 * judged.singular_values[0]
     with pytest.raises(InputError, match="overall scale"):
-        require_scale(judged, objective, evaluation)
+        identify.require_scale(judged, objective, evaluation)
 
 
 def test_gravity_makes_the_scale_known(small_bench, noisy):
@@ -129,8 +126,8 @@ def test_gravity_makes_the_scale_known(small_bench, noisy):
     objective = small_bench.objective([pull], SETTINGS)
     require_scale_in_principle(objective.forwards)
     evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
-    judged = identifiability(evaluation, objective.space)
-    require_scale(judged, objective, evaluation)
+    judged = identify.identifiability(evaluation, objective.space)
+    identify.require_scale(judged, objective, evaluation)
 
 
 def test_what_lies_beyond_the_grasp_is_linked(at_truth, objective):
@@ -138,7 +135,7 @@ def test_what_lies_beyond_the_grasp_is_linked(at_truth, objective):
     its interval is as wide, the neighbour's stays as it was.
     """
     blind = replace(at_truth, jacobian=at_truth.jacobian * [1.0, 1.0, 1.0, 1e-4])
-    space, messages = link_unresolved(blind, objective.space)
+    space, messages = identify.link_unresolved(blind, objective.space)
     assert space.links == ((3, 2),) and space.size == 4
     assert "E4" in messages[0] and "of E3" in messages[0]
     linked = objective.with_space(space)
@@ -153,9 +150,9 @@ def test_what_lies_beyond_the_grasp_is_linked(at_truth, objective):
     assert found.covariance[2, 2]**0.5 == pytest.approx(
         alone * found.variance_factor**0.5 * found.repetition**0.5, rel=0.02)
     # Judged again, the link's own row does not count as data.
-    again, _ = link_unresolved(whole, space)
+    again, _ = identify.link_unresolved(whole, space)
     assert again.links == space.links
-    assert link_unresolved(at_truth, objective.space)[1] == []
+    assert identify.link_unresolved(at_truth, objective.space)[1] == []
 
 
 @pytest.mark.slow
@@ -199,9 +196,22 @@ def test_a_stopped_estimate_keeps_its_best_and_resumes(tmp_path, small_bench, no
     again = EvaluationLog(path, "problem")
     assert again.resumed_count == 3
     assert again.best.objective == min(entry.objective for entry in log.entries)
-    known = again.find(start)
-    assert known.objective == log.entries[0].objective
     assert EvaluationLog(path, "another").resumed_count == 0
+
+
+def test_a_fit_ends_with_its_budget(monkeypatch, small_bench, noisy, fitted):
+    """Of work, so at the same digits again; its intervals hold where it was going, no evaluation
+    begins without budget, and nothing is shown as found."""
+    spent = objective_module.WORK_LIMIT - fitted.objective.work.left
+    monkeypatch.setattr(objective_module, "WORK_LIMIT", 0.4 * spent)
+    one, again = (small_bench.fit([noisy], SETTINGS) for _ in range(2))
+    assert one.fit.status is FitStatus.out_of_work and not one.warnings
+    assert np.array_equal(one.values.young, again.values.young)
+    assert "budget was spent" in one.is_bad and "standard deviations" in one.is_bad
+    assert np.all((one.uncertainty.young_interval > fitted.values.young[:, None]) == [False, True])
+    monkeypatch.setattr(objective_module, "WORK_LIMIT", 0.0)
+    with pytest.raises(WorkError, match="budget before it found an equilibrium"):
+        small_bench.fit([noisy], SETTINGS)
 
 
 def test_a_stop_without_an_equilibrium_says_so(small_bench, noisy, monkeypatch):

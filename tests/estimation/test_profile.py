@@ -22,7 +22,7 @@ class TwoPieces:
     """A firm piece and a soft one in a row, each bent by its compliance; two readings of that."""
 
     bends = np.array([[1.0, 0.0], [1.0, 1.0]])
-    noise = np.array([0.03, 0.35])
+    noise, variance = np.array([0.03, 0.35]), 1.0
     """With both compliances 1, the second is told to a third of itself."""
     space = ParameterSpace.separate(Values(np.array([1e8, 1e8]), 0.35, 900.0))
 
@@ -64,11 +64,20 @@ def test_a_soft_piece_is_missed_as_often_to_one_side_as_to_the_other():
         best = drawn.best()
         sure = drawn.sure(best)
         plain.append(missed(sure.young_interval[1], 1e8))
-        found.append(missed(profiled(sure, best, drawn).young_interval[1], 1e8))
+        found.append(missed(profiled(sure, best, drawn)[0].young_interval[1], 1e8))
     too_soft, too_stiff = 100 * np.mean(plain, axis=0)
     assert too_soft > 4.5 and too_stiff < 0.2
     too_soft, too_stiff = 100 * np.mean(found, axis=0)
     assert 1.5 < too_soft < 3.5 and 1.5 < too_stiff < 3.5
+
+
+def test_a_profile_that_meets_a_lower_loss_tells_where():
+    """There was no end of the fit; at its end there is no lower one."""
+    drawn = TwoPieces(np.array([1.0, 2.0]))
+    early = drawn.evaluate(drawn.best().free + [0.0, 1.5], jacobian=True)
+    _, lower, _ = profiled(drawn.sure(early), early, drawn)
+    assert lower.objective < early.objective - 0.1
+    assert profiled(drawn.sure(lower), drawn.best(), drawn)[1] is None
 
 
 def test_where_any_stiffness_fits_neighbours_end_the_interval():
@@ -76,7 +85,7 @@ def test_where_any_stiffness_fits_neighbours_end_the_interval():
     drawn = TwoPieces(np.array([1.0, 1.6]))
     best = drawn.best()
     told = []
-    found = profiled(drawn.sure(best), best, drawn, Progress(on_warning=told.append))
+    found, _, _ = profiled(drawn.sure(best), best, drawn, Progress(on_warning=told.append))
     assert found.young_interval[1, 1] == pytest.approx(1e8 * np.exp(1.96 * LINK_DEVIATION))
     assert "E2" in told[0] and len(told) == 1
     # The firm one's is narrow: it stays.
@@ -96,7 +105,7 @@ def test_limits_of_a_pull_are_where_the_squares_have_risen(small_bench, small_pu
                    covariance=np.diag(deviation**2))
     before = objective.evaluate(best.free, jacobian=True)
     widest = int(np.argmax(deviation[:4]))
-    limits = np.log(profiled(sure, best, objective).young_interval[widest])
+    limits = np.log(profiled(sure, best, objective)[0].young_interval[widest])
     assert objective.evaluate(best.free) is before
     assert limits.mean() > best.free[widest]
     others = np.arange(len(best.free)) != widest

@@ -11,6 +11,7 @@ from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import SILENT, Progress
 from limber.estimation import fit
+from limber.estimation.fitting import objective
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.geometry.settings import ReconstructSettings
@@ -120,6 +121,21 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
                     resume=True).run(Progress(on_warning=warnings.append))
     assert any("Resumed" in warning for warning in warnings)
     assert result["converged"] and not result["stopped"]
+
+
+@pytest.mark.slow
+def test_an_estimate_without_budget_goes_on_when_it_is_run_again(branch_folder, monkeypatch):
+    """The best so far with its reason, and the mesh untouched; the next run ends as any does."""
+    before = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
+    monkeypatch.setattr(objective, "WORK_LIMIT", 1.0)
+    short = Fit.of(QUICK, branch_folder=branch_folder).run()
+    assert not short["converged"] and "not ended" in short["warnings"][-1] and not short["causes"]
+    assert np.array_equal(TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"], before)
+    monkeypatch.undo()
+    found = Fit.of(QUICK, branch_folder=branch_folder).run()
+    assert found["converged"] and any("Resumed: 1 " in each for each in found["warnings"])
+    assert found["young_pa"] == pytest.approx(
+        Fit.of(QUICK, branch_folder=branch_folder, force=True).run()["young_pa"], rel=0.01)
 
 
 @pytest.mark.slow

@@ -175,8 +175,8 @@ def summary(found: Estimate, settings: FitSpec) -> dict[str, Any]:
         "young_deviation": found.deviations, "poisson": values.poisson,
         "recording_spread": sure.recording_spread,
         "field_form": values.form, "cell_errors": found.cell_errors,
-        "causes": [] if found.stopped else largest(found.causes),
-        "next_actions": [] if found.stopped else found.prospects.best(),
+        "causes": [] if found.fit.is_unfinished else largest(found.causes),
+        "next_actions": [] if found.fit.is_unfinished else found.prospects.best(),
         "led_by": {forward.name: "force; the gripper's path is observed" if forward.watches_pose
                    else forward.drive for forward in found.objective.forwards},
         "density": values.density, "loss_m2": found.fit.evaluation.loss,
@@ -200,7 +200,7 @@ def _bending(found: Estimate) -> dict[str, Any]:
 def _by_pull(found: Estimate) -> dict[str, Any]:
     """Each pull's modulus beside the joint one, and the change per day; of one pull nothing."""
     sure, objective = found.uncertainty, found.objective
-    if len(objective.forwards) < 2 or found.stopped:
+    if len(objective.forwards) < 2 or found.fit.is_unfinished:
         return {}
     steps = scale_steps(found.fit.evaluation, objective, sure.variance_factor * sure.repetition)
     recorded = [objective.forwards[each.pull].entry.recorded for each in steps]

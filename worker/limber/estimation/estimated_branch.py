@@ -13,23 +13,10 @@ from limber.core.errors import Command, InputError, Option
 from limber.core.json_values import stored
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.estimation.forward.forward_model import (
-    Forward,
-    PointDirections,
-    compliance,
-    nodal_loads,
-    under_its_weight,
-)
+from limber.estimation import parameters
+from limber.estimation.forward import forward_model as models
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.solved_pull import Lumping, QuasiStaticForward, uses_torque
-from limber.estimation.parameters import (
-    BULK,
-    ParameterSpace,
-    Values,
-    YoungField,
-    bulk_prior,
-    open_field,
-)
 from limber.estimation.settings import FitSpec
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton, control_points
@@ -67,20 +54,20 @@ class Subject:
     control_points: np.ndarray
     weights: np.ndarray
     model: BranchModel
-    start: Values
-    field: YoungField | None = None
+    start: parameters.Values
+    field: parameters.YoungField | None = None
     lumping: Lumping | None = None
 
-    def young(self, values: Values) -> np.ndarray:
+    def young(self, values: parameters.Values) -> np.ndarray:
         """Young's modulus of the tetrahedra [Pa], shape [tet_count]."""
-        return (self.field or YoungField(self.weights)).young(values)
+        return (self.field or parameters.YoungField(self.weights)).young(values)
 
     @property
     def hangs(self) -> bool:
         """Whether its weight acts in the scanned shape."""
         return self.model.prestress is not None and bool(self.model.gravity.any())
 
-    def carries_itself(self, values: Values) -> bool:
+    def carries_itself(self, values: parameters.Values) -> bool:
         """Whether it is stable in the scanned shape under its weight, with these values."""
         return is_stable(self.model.with_parameters(
             young=self.young(values), poisson=values.poisson, density=values.density))
@@ -194,8 +181,8 @@ def _response_change(whole: BranchModel, part: BranchModel, pull: Pull, points: 
     for model in (whole, part):
         plain = model.with_parameters(young=float(np.mean(model.young)), gravity=(0.0, 0.0, 0.0))
         grasp, rest = grasp_on(model.mesh, pull.entry.grasp), np.zeros_like(model.mesh.nodes)
-        moved = compliance(plain, rest, nodal_loads(grasp, pull.entry.grasp, np.zeros(6),
-                                                    model.mesh.nodes, 3))
+        moved = models.compliance(plain, rest, models.nodal_loads(
+            grasp, pull.entry.grasp, np.zeros(6), model.mesh.nodes, 3))
         operator = point_operator(model.mesh, np.vstack([points, pull.entry.grasp.point_m]))
         seen.append(np.array([operator @ each.ravel() for each in moved]))
     return float(np.linalg.norm(seen[1] - seen[0]) / np.linalg.norm(seen[0]))
@@ -223,12 +210,13 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     model = BranchModel(mesh, young=MODEL_YOUNG_PA, poisson=poisson, density=density,
                         gravity=gravity if settings.gravity else None, point_masses=masses)
     model = model.as_scanned() if settings.gravity else model
-    start = Values(np.full(len(points), young), poisson, density, astuple(RayleighDamping()))
+    start = parameters.Values(np.full(len(points), young), poisson, density,
+                              astuple(RayleighDamping()))
     factor = LayeredSection(**settings.section).on(mesh, skeleton) if settings.section else 1.0
     weights = np.reshape(factor, (-1, 1)) * young_weights(mesh, points)
     field = None
     if settings.field == "open" and settings.method == "gauss-newton":
-        field = open_field(mesh, skeleton, weights, settings.initial_fractions,
+        field = parameters.open_field(mesh, skeleton, weights, settings.initial_fractions,
                            log_factor=np.log(factor), by_order="orders" in settings.also)
     return Subject(mesh, skeleton, points, weights, model, start, field)
 
@@ -288,7 +276,7 @@ def neck(skeleton: Skeleton) -> list[str]:
 
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
-                shifts: Mapping[str, np.ndarray] | None = None) -> list[Forward]:
+                shifts: Mapping[str, np.ndarray] | None = None) -> list[models.Forward]:
     """Make each pull's simulation; by name, ``shifts`` [m] are how much farther along the branch
     points are than stated. InputError if nothing is measured, or observed points differ."""
     forwards = []
@@ -309,7 +297,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
         _off_at_rest(pull, frames, rest)
         moved = (shifts or {}).get(pull.name)
         if moved is not None:
-            rest = rest + moved[:, None] * PointDirections.at(subject.mesh, rest).rest
+            rest = rest + moved[:, None] * models.PointDirections.at(subject.mesh, rest).rest
         forward = _forward(pull.name, entry, frames, rest, subject, settings)
         forward.skeleton = subject.skeleton
         if isinstance(forward, QuasiStaticForward):
@@ -320,7 +308,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
     return forwards
 
 
-def require_scale_in_principle(forwards: list[Forward]) -> None:
+def require_scale_in_principle(forwards: list[models.Forward]) -> None:
     """Reject pulls that cannot determine the scale of Young's modulus. InputError if all pulls are
     slow and pose-driven, without gravity or measured force."""
     for forward in forwards:
@@ -338,7 +326,7 @@ def require_scale_in_principle(forwards: list[Forward]) -> None:
 
 
 def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
-             settings: FitSpec) -> Forward:
+             settings: FitSpec) -> models.Forward:
     if entry.motion == "swing":
         raise InputError(f"{name} is a free swing: no gripper holds the branch.",
                          "Its release, load and damping are fitted together over time.",
@@ -365,27 +353,28 @@ def observes_path(entry: PullEntry, frames: Frames, settings: FitSpec) -> bool:
             and (entry.grasp.mode == "point" or uses_torque(entry, frames)))
 
 
-def parameter_space(subject: Subject, forwards: list[Forward], settings: FitSpec,
-                    ) -> ParameterSpace:
+def parameter_space(subject: Subject, forwards: list[models.Forward], settings: FitSpec,
+                    ) -> parameters.ParameterSpace:
     """Return the free parameters: Poisson's ratio, density if weight or inertia acts, and the
     field's form within their priors; requested ones (``--also``) without a prior."""
     fitted = {name: part in settings.also for name, part in (
-        (BULK, "poisson"), ("density", "density"), ("alpha", "damping"),
+        (parameters.BULK, "poisson"), ("density", "density"), ("alpha", "damping"),
         ("beta", "damping"))}
     chosen = {name for name, is_fitted in fitted.items() if is_fitted}
     form = subject.field.names if subject.field is not None else ()
     priors = [(name, 0.0, 1.0) for name in form]
     if settings.method == "gauss-newton":
-        weighs = any(forward.is_dynamic or under_its_weight(
+        weighs = any(forward.is_dynamic or models.under_its_weight(
             subject.model, forward.entry).gravity.any() for forward in forwards)
-        if settings.poisson_sigma > 0 and BULK not in chosen:
-            priors.append((BULK, *bulk_prior(subject.start.poisson, settings.poisson_sigma)))
+        if settings.poisson_sigma > 0 and parameters.BULK not in chosen:
+            priors.append((parameters.BULK, *parameters.bulk_prior(
+                subject.start.poisson, settings.poisson_sigma)))
         if settings.density_sigma > 0 and "density" not in chosen and weighs:
             priors.append(("density", float(np.log(subject.start.density)),
                            settings.density_sigma))
     free = chosen | {name for name, _, _ in priors}
     extra = (*form, *(name for name in fitted if name in free))
-    return ParameterSpace(subject.start, tuple(range(len(subject.start.young))), extra,
+    return parameters.ParameterSpace(subject.start, tuple(range(len(subject.start.young))), extra,
                           priors=tuple(priors))
 
 

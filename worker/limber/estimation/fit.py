@@ -14,30 +14,12 @@ from limber.core.errors import InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
-from limber.estimation.estimated_branch import (
-    Subject,
-    forwards_of,
-    parameter_space,
-    require_scale_in_principle,
-)
-from limber.estimation.fit_assessment import (
-    MISFIT_FACTOR,
-    Estimate,
-    hold_out,
-    judge_fit,
-    require_one_explanation,
-)
+from limber.estimation import estimated_branch as subjects
+from limber.estimation import fit_assessment as assessment
 from limber.estimation.fitting import initial_modulus as starts
+from limber.estimation.fitting import objective as targets
+from limber.estimation.fitting import optimise
 from limber.estimation.fitting.nuisances import NAMED
-from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective, Stopped
-from limber.estimation.fitting.optimise import (
-    EVALUATION_LIMIT,
-    Fit,
-    FitStatus,
-    best_so_far,
-    gauss_newton,
-    nelder_mead,
-)
 from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.solved_pull import QuasiStaticForward
@@ -58,15 +40,18 @@ class _ForceLeadsNowhereError(WorkError):
     """No equilibrium under a pull's measured force; there may be one along its path."""
 
 
-def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
-               log: EvaluationLog, near: Values | None = None, known: Sequence[Forward] = (),
-               quick: bool = False, progress: Progress = SILENT) -> Estimate:
+def fit_branch(pulls: list[Pull], subject: subjects.Subject, settings: FitSpec, *,
+               log: targets.EvaluationLog, near: Values | None = None,
+               known: Sequence[Forward] = (), quick: bool = False, progress: Progress = SILENT,
+               work: targets.Work | None = None) -> assessment.Estimate:
     """Estimate Young's modulus of a branch from its pulls.
 
     Args:
         log: Stores the evaluations. Those of a stopped run are reused.
         near, quick: As for :func:`fit_pulls`.
         known: The pulls as an earlier fit near there left them: it begins with their states.
+        work: What earlier fits have spent of the budget. Where it ends the fit, another one with
+            the same log goes on from there.
 
     Raises:
         InputError: the pulls cannot determine Young's modulus.
@@ -75,7 +60,10 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
     """
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
-    found = _Strategy(pulls, subject, settings, near, known, progress).fitted(log)
+    found = _Strategy(pulls, subject, settings, near, known, progress,
+                      work or targets.Work()).fitted(log)
+    if found.fit.status is optimise.FitStatus.out_of_work:
+        log.go_on_from(found.fit.evaluation)
     if not quick:
         complete(found, settings, progress)
     return found
@@ -87,26 +75,27 @@ class _Strategy:
     their path; the observer's frame put right; points placed where they were seen."""
 
     pulls: list[Pull]
-    subject: Subject
+    subject: subjects.Subject
     settings: FitSpec
     near: Values | None
     known: Sequence[Forward]
     progress: Progress
+    work: targets.Work
 
-    def fitted(self, log: EvaluationLog) -> Estimate:
+    def fitted(self, log: targets.EvaluationLog) -> assessment.Estimate:
         """The estimate with the weight; without it if the weight cannot be carried."""
         if not (self.subject.hangs and any(under_its_weight(
                 self.subject.model, pull.entry).prestress is not None for pull in self.pulls)):
             return self._driven(log)
-        heavy: Estimate | None = None
+        heavy: assessment.Estimate | None = None
         failure: Exception | None = None
         try:
             heavy = self._driven(log)
-            sound = (heavy.uncertainty.variance_factor < MISFIT_FACTOR
+            sound = (heavy.uncertainty.variance_factor < assessment.MISFIT_FACTOR
                      and abs(heavy.density_off) < NAMED)
             # A much softer branch would carry the weight too: then it is no cause of what is off.
             margin = 1.0 if sound else FAR_FROM_FOLDING
-            if heavy.stopped or self.subject.carries_itself(
+            if heavy.fit.is_unfinished or self.subject.carries_itself(
                     replace(heavy.values, young=margin * heavy.values.young)):
                 return heavy
         except (WorkError, NotPositiveDefiniteError) as error:
@@ -126,10 +115,10 @@ class _Strategy:
             return present(heavy, "estimate with the weight")
         return found
 
-    def _weightless(self) -> Estimate:
+    def _weightless(self) -> assessment.Estimate:
         """The estimate without the weight, with a warning if it tells a scale."""
         found = replace(self, subject=self.subject.without_weight())._driven(
-            EvaluationLog(None, ""))
+            targets.EvaluationLog(None, ""))
         found.is_weightless = not self.subject.carries_itself(found.values)
         if found.is_weightless and found.scale_deviation <= identify.SCALE_DEVIATION:
             # Otherwise nothing is known of how soft it is, and the estimate is refused.
@@ -138,7 +127,7 @@ class _Strategy:
                 "ignores its weight. Check the density, gravity and the unit of the force.")
         return found
 
-    def _driven(self, log: EvaluationLog) -> Estimate:
+    def _driven(self, log: targets.EvaluationLog) -> assessment.Estimate:
         """The fit by the measured force; along the recorded path where that leads nowhere."""
         try:
             return self._framed(log)
@@ -147,35 +136,35 @@ class _Strategy:
                                "prescribed instead.")
             try:
                 # Force-driven evaluations do not apply here.
-                return self._with(drive="pose")._framed(EvaluationLog(None, ""))
+                return self._with(drive="pose")._framed(targets.EvaluationLog(None, ""))
             except WorkError as second:
                 raise error from second
 
-    def _framed(self, log: EvaluationLog) -> Estimate:
+    def _framed(self, log: targets.EvaluationLog) -> assessment.Estimate:
         """The fit in the observer's frame; a free one, which may be far turned, is put right."""
         if "frame" not in self.settings.also:
             return self._placed(log)
         step, found = self, self._placed(log)
         for _ in range(starts.ROUNDS - 1):
             shift, turn = starts.fitted_frame(found.cell_errors)
-            if found.stopped or np.linalg.norm(turn) < starts.SMALL_RAD:
+            if found.fit.is_unfinished or np.linalg.norm(turn) < starts.SMALL_RAD:
                 break
             middle = found.objective.forwards[0].rest_points.mean(axis=0)
             step = replace(step, pulls=[
                 starts.put_right(one, shift, turn, middle) for one in step.pulls])
-            found = step._placed(EvaluationLog(None, ""))
+            found = step._placed(targets.EvaluationLog(None, ""))
         try:
             other = self._with(also=tuple(part for part in self.settings.also if part != "frame")
-                               )._placed(EvaluationLog(None, ""))
+                               )._placed(targets.EvaluationLog(None, ""))
         except (WorkError, InputError):
             return found
-        require_one_explanation(found, other)
+        assessment.require_one_explanation(found, other)
         return found
 
-    def _placed(self, log: EvaluationLog) -> Estimate:
+    def _placed(self, log: targets.EvaluationLog) -> assessment.Estimate:
         """The fit with points where the branch shows that they are, if that is far from where they
         are stated: an error along a bent branch is not linear."""
-        forwards = forwards_of(self.pulls, self.subject, self.settings)
+        forwards = subjects.forwards_of(self.pulls, self.subject, self.settings)
         near, shifts, known = self.near, {}, self.known
         beams = [] if any(forward.is_dynamic for forward in forwards) else starts.beams_of(forwards)
         if beams:
@@ -188,19 +177,19 @@ class _Strategy:
                       if np.any(forward.point_shifts)}
         for rounds_left in reversed(range(starts.ROUNDS)):
             if shifts:
-                forwards = forwards_of(self.pulls, self.subject, self.settings, shifts)
+                forwards = subjects.forwards_of(self.pulls, self.subject, self.settings, shifts)
             _begin_at(forwards, known)
-            objective = Objective(
-                forwards, parameter_space(self.subject, forwards, self.settings), log=log,
+            objective = targets.Objective(
+                forwards, subjects.parameter_space(self.subject, forwards, self.settings), log=log,
                 force_sigma=[pull.entry.sensor.force_sigma_n for pull in self.pulls],
-                progress=self.progress,
+                progress=self.progress, work=self.work,
                 expected_count=20 if self.settings.method == "gauss-newton" else 200)
             found = fit_pulls(objective, self.subject.start, self.settings, self.progress,
                               near=near, quick=True)
             far = starts.far_points(found.cell_errors, shifts)
-            if far is None or found.stopped or not rounds_left:
+            if far is None or found.fit.is_unfinished or not rounds_left:
                 return found
-            shifts, near, log, known = far, found.values, EvaluationLog(None, ""), forwards
+            shifts, near, log, known = far, found.values, targets.EvaluationLog(None, ""), forwards
         raise AssertionError("the last round looks for no far points")
 
     def _with(self, **changes: Any) -> "_Strategy":
@@ -216,16 +205,19 @@ def _begin_at(forwards: Sequence[Forward], known: Sequence[Forward]) -> None:
             forward.begin_at(earlier)
 
 
-def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
+def fit_pulls(objective: targets.Objective, start: Values, settings: FitSpec,
               progress: Progress = SILENT, *, near: Values | None = None,
-              quick: bool = False) -> Estimate:
+              quick: bool = False) -> assessment.Estimate:
     """Check what the data determine, fit, and compute intervals; ``quick`` keeps Gauss' and judges
     nothing (:func:`complete`). It starts from ``near`` if that has an equilibrium, otherwise from
     moduli of the right size."""
-    require_scale_in_principle(objective.forwards)
+    subjects.require_scale_in_principle(objective.forwards)
+    is_near, best = near is not None, objective.log.best
+    if objective.log.resumed_count and best and len(best.parameters) == objective.space.size:
+        is_near, near = False, objective.space.unpack(np.array(best.parameters))
     first = None if near is None else objective.evaluate(objective.space.pack(near),
                                                          jacobian=True)
-    is_near = near is not None and first is not None
+    is_near &= first is not None
     if first is None:
         near, first = _standing(objective, start, progress)
     start = present(near, "initial values")
@@ -238,38 +230,51 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
         objective = objective.with_space(space)
     try:
         fit = _fitted(objective, space.pack(start), settings, progress, is_near=is_near)
-    except Stopped:
-        fit = best_so_far(objective)
-    stopped = fit.status is FitStatus.stopped
-    if settings.method == "gauss-newton" and not stopped:
+    except targets.Stopped:
+        fit = optimise.best_so_far(objective)
+    if settings.method == "gauss-newton" and not fit.is_unfinished:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
         fit, objective = with_creep(fit, objective)
         fit = covariance.weighed(fit, objective)
         _require_stable(objective, objective.space.unpack(fit.evaluation.free))
         fit = covariance.averaged(fit, objective)
-    elif not stopped:
+    elif not fit.is_unfinished:
         for message in identify.link_unresolved(fit.evaluation, objective.space)[1]:
             progress.warn(message)
-    found = Estimate(fit, objective, covariance.uncertainty(fit.evaluation, objective), judged)
+    found = assessment.Estimate(
+        fit, objective, covariance.uncertainty(fit.evaluation, objective, fit.left), judged)
     if not quick:
         complete(found, settings, progress)
     return found
 
 
-def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) -> None:
+def complete(found: assessment.Estimate, settings: FitSpec, progress: Progress = SILENT) -> None:
     """Compute the intervals of a quick fit by the profile of its likelihood, and judge it. A fit
     without a valid result has no intervals."""
-    is_sound = not found.stopped and found.is_bad is None
-    if is_sound:
-        found.uncertainty = covariance.profiled(
+    while found.is_bad is None:
+        found.uncertainty, lower, objective = covariance.profiled(
             found.uncertainty, found.fit.evaluation, found.objective, progress)
-    judge_fit(found, progress)
-    if settings.hold_out and len(found.objective.forwards) > 1 and is_sound:
-        hold_out(found, progress)
+        if lower is None or not _descended(found, lower, objective):
+            break
+    assessment.judge_fit(found, progress)
+    if settings.hold_out and len(found.objective.forwards) > 1 and found.is_bad is None:
+        assessment.hold_out(found, progress)
 
 
-def _standing(objective: Objective, start: Values, progress: Progress,
-              ) -> tuple[Values, Evaluation]:
+def _descended(found: assessment.Estimate, lower: targets.Evaluation,
+               objective: targets.Objective) -> bool:
+    """Whether a fit from there ends lower; it then replaces the estimate's."""
+    fit = optimise.gauss_newton(objective, lower.free, is_near=True)
+    if optimise.cost_of(fit.evaluation, objective) > optimise.cost_of(
+            found.fit.evaluation, objective) - optimise.UNSETTLED_FALL * objective.variance:
+        return False
+    found.fit, found.objective = covariance.averaged(fit, objective), objective
+    found.uncertainty = covariance.uncertainty(fit.evaluation, objective, fit.left)
+    return True
+
+
+def _standing(objective: targets.Objective, start: Values, progress: Progress,
+              ) -> tuple[Values, targets.Evaluation]:
     """Return initial values that have equilibria, and their evaluation."""
     for drifts in (False, True):
         begun = starts.scaled_start(objective, start, drifts=drifts)
@@ -285,7 +290,7 @@ def _standing(objective: Objective, start: Values, progress: Progress,
     return begun, first
 
 
-def _require_stable(objective: Objective, values: Values) -> None:
+def _require_stable(objective: targets.Objective, values: Values) -> None:
     """Refuse to drive pulls by a force under which the observed states are unstable."""
     names = [forward.name for forward in objective.forwards
              if isinstance(forward, ObservedPathForward)
@@ -298,7 +303,7 @@ def _require_stable(objective: Objective, values: Values) -> None:
             "Pull outwards or sideways rather than towards the base.")
 
 
-def _without_equilibrium(objective: Objective) -> WorkError:
+def _without_equilibrium(objective: targets.Objective) -> WorkError:
     seen = "The simulation finds no equilibrium for any of the tested Young's moduli."
     by_force = [forward for forward in objective.forwards if forward.watches_pose]
     if not by_force:
@@ -316,25 +321,17 @@ def _without_equilibrium(objective: Objective) -> WorkError:
         "check the grasp point, the frame of reference and the units.")
 
 
-def _fitted(objective: Objective, start: np.ndarray, settings: FitSpec,
-            progress: Progress, *, is_near: bool) -> Fit:
+def _fitted(objective: targets.Objective, start: np.ndarray, settings: FitSpec,
+            progress: Progress, *, is_near: bool) -> optimise.Fit:
     if settings.method == "nelder-mead":
-        fit = nelder_mead(objective, start, evaluation_limit=EVALUATION_LIMIT,
-                          delta_m2=settings.delta_m2)
+        fit = optimise.nelder_mead(objective, start, delta_m2=settings.delta_m2)
     else:
-        fit = gauss_newton(objective, _resumed(objective, start), is_near=is_near,
-                           evaluation_limit=EVALUATION_LIMIT)
-    return _refined(fit, objective, settings, progress)
+        fit = optimise.gauss_newton(objective, start, is_near=is_near)
+    return fit if fit.is_unfinished else _refined(fit, objective, settings, progress)
 
 
-def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
-    best = objective.log.best
-    return np.array(best.parameters) if objective.log.resumed_count and best and len(
-        best.parameters) == len(start) else start
-
-
-def _refined(fit: Fit, objective: Objective, settings: FitSpec,
-             progress: Progress) -> Fit:
+def _refined(fit: optimise.Fit, objective: targets.Objective, settings: FitSpec,
+             progress: Progress) -> optimise.Fit:
     """Simulate more key frames if the spline error between them exceeds the measurement noise."""
     for _ in range(3):
         coarse = []
@@ -356,14 +353,13 @@ def _refined(fit: Fit, objective: Objective, settings: FitSpec,
         if fresh.evaluate(fit.evaluation.free, jacobian=True) is None:
             for forward in coarse:  # the states between known ones lead nowhere: from rest
                 forward.hint(None)
-        fit = gauss_newton(fresh, fit.evaluation.free, evaluation_limit=EVALUATION_LIMIT,
-                           is_near=True)
+        fit = optimise.gauss_newton(fresh, fit.evaluation.free, is_near=True)
         objective.forward_count = fresh.forward_count
     return fit
 
 
-def _linked_at_the_end(fit: Fit, objective: Objective, settings: FitSpec,
-                       progress: Progress) -> tuple[Fit, Objective]:
+def _linked_at_the_end(fit: optimise.Fit, objective: targets.Objective, settings: FitSpec,
+                       progress: Progress) -> tuple[optimise.Fit, targets.Objective]:
     """Link what the data do not determine at the solution, and fit again if the links differ. After
     the first round links are only added; otherwise the iteration might not end."""
     messages: list[str] = []
@@ -377,7 +373,7 @@ def _linked_at_the_end(fit: Fit, objective: Objective, settings: FitSpec,
             break
         start = fit.evaluation.free
         objective = objective.with_space(space)
-        fit = gauss_newton(objective, start, evaluation_limit=EVALUATION_LIMIT)
+        fit = optimise.gauss_newton(objective, start)
     for message in messages:
         progress.warn(message)
     return fit, objective
@@ -428,7 +424,7 @@ def equal_fractions(count: int) -> tuple[float, ...]:
     return tuple((k + 1) / (count + 1) for k in range(count))
 
 
-def supported(found: Estimate) -> Support:
+def supported(found: assessment.Estimate) -> Support:
     """Return as many control points as the pulls support, by a fit with those at ``FRACTIONS``."""
     problem = _Problem.of(found)
     parts = {count: problem.posterior(equal_fractions(count)) for count in range(1, MOST + 1)}
@@ -452,7 +448,7 @@ class _Problem:
     by_others: np.ndarray
 
     @classmethod
-    def of(cls, found: Estimate) -> "_Problem":
+    def of(cls, found: assessment.Estimate) -> "_Problem":
         evaluation, space = found.fit.evaluation, found.objective.space
         field = found.objective.forwards[0].field
         residual, slopes = (

@@ -19,16 +19,11 @@ from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import AT_REST_M
 from limber.estimation.parameters import Values, pieces_along
 from limber.estimation.settings import FitSpec
+from limber.estimation.uncertainty import identifiability as identify
 from limber.estimation.uncertainty import model_error as errors
 from limber.estimation.uncertainty import shape_error as shapes
 from limber.estimation.uncertainty.covariance import Uncertainty, largest, outliers, variance_parts
 from limber.estimation.uncertainty.creep import creep_sentence
-from limber.estimation.uncertainty.identifiability import (
-    SCALE_DEVIATION,
-    Identifiability,
-    identifiability,
-    too_little_said,
-)
 from limber.estimation.uncertainty.model_error import ModelError
 from limber.estimation.uncertainty.next_actions import Prospects
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -83,7 +78,7 @@ class Estimate:
     fit: Fit
     objective: Objective
     uncertainty: Uncertainty
-    identifiability: Identifiability
+    identifiability: identify.Identifiability
     warnings: list[str] = field(default_factory=list)
     held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
     model_error: ModelError = field(default_factory=ModelError)
@@ -153,7 +148,7 @@ class Estimate:
     @property
     def scale_deviation(self) -> float:
         """Standard deviation of the common log E at the end of the fit."""
-        return identifiability(self.fit.evaluation, self.objective.space).scale_deviation
+        return identify.identifiability(self.fit.evaluation, self.objective.space).scale_deviation
 
     @property
     def density_off(self) -> float:
@@ -165,6 +160,8 @@ class Estimate:
     @property
     def is_bad(self) -> str | None:
         """Reason why the fit gives no valid result; None if it does."""
+        if self.fit.is_unfinished:
+            return f"The fit has not ended: {self.fit.reason}"
         space = self.objective.space
         bound = [name for name in space.on_bound(self.fit.evaluation.free)
                  if name not in {prior for prior, _, _ in space.priors}]
@@ -179,7 +176,7 @@ class Estimate:
         if error := nuisances.unlikely(self.cell_errors):
             return error
         scale = self.scale_deviation
-        if not scale <= SCALE_DEVIATION:
+        if not scale <= identify.SCALE_DEVIATION:
             return ("The data do not determine the moduli: their common scale is known only to "
                     f"within a factor of {np.exp(min(2 * scale, 20)):.2g}.")
         if not self.fit.converged:
@@ -204,7 +201,10 @@ class Estimate:
 
 
 def judge_fit(found: Estimate, progress: Progress) -> None:
-    """Report the quality of the fit, the errors of the cell, and the outliers."""
+    """Report the quality of the fit, the errors of the cell, and the outliers; of an unfinished
+    fit nothing is known."""
+    if found.fit.is_unfinished:
+        return
     if found.uncertainty.variance_factor > MISFIT_FACTOR:
         progress.warn(
             f"The fit is poor: the residuals are {found.uncertainty.variance_factor**0.5:.1f} "
@@ -216,7 +216,7 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
             f"The residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated "
             "noise. Either the model lacks an effect, or the sensors are noisier than stated. The "
             "intervals are widened by this factor.")
-    if found.stopped or found.is_bad is None:
+    if found.is_bad is None:
         # Of a refused fit neither is known, and no interval includes them.
         if (corrected := nuisances.in_words(found.cell_errors)) is not None:
             progress.warn(corrected)
@@ -278,9 +278,10 @@ def require_result(found: Estimate, skeleton: Skeleton) -> None:
     reason = found.is_bad
     if reason is None:
         return
-    if not found.scale_deviation <= SCALE_DEVIATION and any(
+    if not found.scale_deviation <= identify.SCALE_DEVIATION and any(
             forward.uses_force for forward in found.objective.forwards):
-        raise too_little_said(found.objective, found.fit.evaluation, SCALE_DEVIATION)
+        raise identify.too_little_said(found.objective, found.fit.evaluation,
+                                       identify.SCALE_DEVIATION)
     ended = f"The fit ended at {_listed(found.values.young)} MPa. Nothing was written."
     reason = " ".join([reason, *_force_off(found)])
     seen = [*_points_off(found.objective.forwards), *neck(skeleton)]
@@ -332,7 +333,7 @@ def require_one_explanation(free: Estimate, as_stated: Estimate) -> None:
     """Refuse a free frame where points that are off along the branch explain the pulls as well.
     WorkError if with the frame as stated the fit is as good, with moduli outside the intervals."""
     loss, other = (each.fit.evaluation.objective for each in (free, as_stated))
-    if free.stopped or as_stated.is_bad is not None or other - loss > AS_LIKELY:
+    if free.fit.is_unfinished or as_stated.is_bad is not None or other - loss > AS_LIKELY:
         return
     low, high = free.uncertainty.young_interval.T
     young = as_stated.values.young

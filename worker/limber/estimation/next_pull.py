@@ -25,16 +25,7 @@ from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.mechanics.model import BranchModel
 from limber.mechanics.strain import strain_state
-from limber.recordings.recording import (
-    CalibrationEntry,
-    GraspEntry,
-    Observations,
-    Pull,
-    PullEntry,
-    SensorEntry,
-    calibration_of,
-    grasp_on,
-)
+from limber.recordings import recording
 
 UNKNOWN_SCALE = 1.15
 """Deviation of the common log E before any measurement: a factor of ten within its 95 %."""
@@ -107,19 +98,19 @@ class Known:
 class Cell:
     """Sensors, calibration and number of frames of a future pull."""
 
-    sensor: SensorEntry = SensorEntry()  # noqa: RUF009 (frozen)
-    calibration: CalibrationEntry = CalibrationEntry()  # noqa: RUF009 (frozen)
+    sensor: recording.SensorEntry = recording.SensorEntry()  # noqa: RUF009 (frozen)
+    calibration: recording.CalibrationEntry = recording.CalibrationEntry()  # noqa: RUF009 (frozen)
     frame_count: int = _RECORDED_FRAMES
 
     @classmethod
-    def of(cls, pull: Pull | None) -> "Cell":
+    def of(cls, pull: recording.Pull | None) -> "Cell":
         """Return the cell of an earlier pull, with that pull's length; without one, a carefully
         calibrated cell."""
         if pull is None:
             return cls()
         seen, entry = pull.observations, pull.entry
         is_alike = entry.motion == "quasi_static"
-        return cls(entry.sensor, calibration_of(entry),
+        return cls(entry.sensor, recording.calibration_of(entry),
                    len(seen.times) if seen is not None and is_alike else _RECORDED_FRAMES)
 
     def in_frames(self, count: int) -> "Cell":
@@ -291,22 +282,22 @@ def _model(subject: Subject, values: Values) -> BranchModel:
 
 
 def _without_noise(choice: PullChoice, subject: Subject, values: Values, cell: Cell,
-                   ) -> tuple[Pull, list[np.ndarray]]:
+                   ) -> tuple[recording.Pull, list[np.ndarray]]:
     """Return a pull as a perfect cell would record it, and the branch's states [m]."""
     skeleton, model = subject.skeleton, _model(subject, values)
     point = skeleton.point_at(choice.fraction)
     times = np.linspace(0.0, _SECONDS, _FRAMES)
-    entry = PullEntry(
+    entry = recording.PullEntry(
         calibration=cell.calibration, sensor=cell.sensor, weightless=not model.gravity.any(),
-        grasp=GraspEntry(point_m=tuple(map(float, point)), mode="point",
+        grasp=recording.GraspEntry(point_m=tuple(map(float, point)), mode="point",
                          radius_m=float(1.3 * skeleton.radius_at(choice.fraction))),
         rest_points_m=tuple(tuple(map(float, p)) for p in subject.control_points),
         source="limber suggest-pull")
-    grasp = grasp_on(subject.mesh, entry.grasp)
+    grasp = recording.grasp_on(subject.mesh, entry.grasp)
     arc = choice.fraction * skeleton.arc_length[skeleton.main_path()[-1]]
     made = moved(model, grasp, MotionWanted(
         kind="pull", point=point, axis=point - skeleton.nodes[0], travel=choice.reach * arc,
         turn=0.0, phase=choice.phase, times=times, weight=np.zeros(3)))
     seen = seen_at(subject.control_points, subject.mesh, made.displacements)
-    return (Pull("suggested", entry, times, made.poses, made.wrenches,
-                 Observations(times, seen)), made.displacements)
+    return (recording.Pull("suggested", entry, times, made.poses, made.wrenches,
+                 recording.Observations(times, seen)), made.displacements)

@@ -5,16 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from limber.core import settings as base
 from limber.core.errors import Option, Text
-from limber.core.settings import (
-    GraspMode,
-    Groups,
-    Settings,
-    possible_density,
-    possible_force,
-    possible_young,
-    within,
-)
 from limber.geometry.settings import DENSITY_SIGMA
 
 if TYPE_CHECKING:
@@ -25,10 +17,10 @@ if TYPE_CHECKING:
 _QUICK = {"key_frames": 4, "hold_out": False, "mesh_check": False, "shapes": 0}
 
 
-class EstimateSettings(Settings):
+class EstimateSettings(base.Settings):
     """Options for estimating Young's modulus from pulls."""
 
-    groups: ClassVar[Groups] = {
+    groups: ClassVar[base.Groups] = {
         "input": ("pull", "drive", "motion", "fractions"),
         "material": ("also", "field", "pith_radius", "bark"),
         "solver": ("method", "delta_m2", "quick"),
@@ -67,7 +59,7 @@ class EstimateSettings(Settings):
     pith_radius: float = Field(
         0.0, ge=0, description="Radius of a hollow or of pith that carries nothing [m]. The "
         "modulus is then that of the wood, and the mesh has an equivalent one for bending.")
-    bark: Annotated[tuple[float, float] | None, within((0, 1), (0, 100))] = Field(
+    bark: Annotated[tuple[float, float] | None, base.within((0, 1), (0, 100))] = Field(
         None, description="Thickness of the bark [m], and the ratio of its Young's modulus to that "
         "of the wood.", json_schema_extra={"metavar": "THICKNESS RATIO"})
 
@@ -101,7 +93,7 @@ class FitSpec(EstimateSettings):
     """An estimate, with what only Python sets."""
 
     key_frames: int = Field(
-        12, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
+        9, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
         "number is doubled if that changes the result.")
     hold_out: bool = Field(
         True, description="With several pulls, fit without each one in turn, and compare it with "
@@ -133,19 +125,19 @@ class FitSpec(EstimateSettings):
         "outside the mesh. The default is the difference between two programs' volumes of one "
         "crown.")
 
-    _young = field_validator("young")(possible_young)
-    _density = field_validator("density")(possible_density)
+    _young = field_validator("young")(base.possible_young)
+    _density = field_validator("density")(base.possible_density)
 
     @classmethod
-    def of(cls, settings: Settings, **more: Any) -> Self:
+    def of(cls, settings: base.Settings, **more: Any) -> Self:
         found = super().of(settings, **more)
         return found.model_copy(update=_QUICK) if found.quick else found
 
 
-class SwingSettings(Settings):
+class SwingSettings(base.Settings):
     """Options for estimating Young's modulus and damping from a free swing."""
 
-    groups: ClassVar[Groups] = {
+    groups: ClassVar[base.Groups] = {
         "input": ("pull",),
     }
     common = ("pull",)
@@ -153,10 +145,10 @@ class SwingSettings(Settings):
     pull: str | None = Field(None, description="Name of the swing. Default: the only one.")
 
 
-class VirtualPullSettings(Settings):
+class VirtualPullSettings(base.Settings):
     """A simulated pull."""
 
-    groups: ClassVar[Groups] = {
+    groups: ClassVar[base.Groups] = {
         "material": ("young",),
         "motion": ("model", "motion", "drive", "frames"),
         "noise": ("camera", "seed"),
@@ -207,7 +199,7 @@ class VirtualPullSettings(Settings):
         return (CalibrationEntry() if self.cell_errors == "realistic"
                 else read_calibration(Path(self.cell_errors)))
 
-    _young = field_validator("young")(possible_young)
+    _young = field_validator("young")(base.possible_young)
 
 
 class PullSpec(VirtualPullSettings):
@@ -222,7 +214,7 @@ class PullSpec(VirtualPullSettings):
         0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
         "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
         "modulus there cannot be estimated.")
-    mode: GraspMode = Field(
+    mode: base.GraspMode = Field(
         "point", description="point: a loop holds the branch and lets it turn. rigid: "
         "the gripper turns the branch less than it would turn freely, so that a torque "
         "acts.")
@@ -255,8 +247,8 @@ class PullSpec(VirtualPullSettings):
         {}, description="Standard deviations in place of those of cell_errors, by their names in "
         "[calibration] of pull.toml.")
 
-    _density = field_validator("density")(possible_density)
-    _force = field_validator("weight")(possible_force)
+    _density = field_validator("density")(base.possible_density)
+    _force = field_validator("weight")(base.possible_force)
 
     @property
     def times(self) -> "np.ndarray":
@@ -272,10 +264,10 @@ class PullSpec(VirtualPullSettings):
         return super().calibration.model_copy(update=self.known)
 
 
-class PredictSettings(Settings):
+class PredictSettings(base.Settings):
     """A load on a branch whose Young's modulus has been estimated."""
 
-    groups: ClassVar[Groups] = {
+    groups: ClassVar[base.Groups] = {
         "input": ("pull",),
         "grasp and loads": ("weight", "load"),
     }
@@ -288,4 +280,4 @@ class PredictSettings(Settings):
     load: tuple[float, float, float] | None = Field(
         None, description="Steady force in any direction, in the branch's frame [N].")
 
-    _force = field_validator("weight", "load")(possible_force)
+    _force = field_validator("weight", "load")(base.possible_force)

@@ -33,16 +33,7 @@ from limber.mechanics.materials.materials import RayleighDamping, young_weights
 from limber.mechanics.model import BranchModel
 from limber.perception.observe import write_depth
 from limber.perception.simulated_camera import render_depth, with_noise
-from limber.recordings.recording import (
-    EXACT,
-    CalibrationEntry,
-    GraspEntry,
-    Observations,
-    Pull,
-    PullEntry,
-    SensorEntry,
-    grasp_on,
-)
+from limber.recordings import recording
 
 # Simulated errors of a cell: drawn once, then applied to its recordings.
 
@@ -52,7 +43,7 @@ class CellErrors:
     """Errors of one cell that all recordings share: gripper's and camera's frame [m, rad] [3], a
     factor on force; ``calibration`` has their deviations."""
 
-    calibration: CalibrationEntry
+    calibration: recording.CalibrationEntry
     gripper_offset: np.ndarray
     gripper_turn: np.ndarray
     force_gain: float
@@ -61,7 +52,8 @@ class CellErrors:
     pivot: np.ndarray | None = None
 
     @classmethod
-    def drawn(cls, calibration: CalibrationEntry, rng: np.random.Generator) -> "CellErrors":
+    def drawn(cls, calibration: recording.CalibrationEntry,
+              rng: np.random.Generator) -> "CellErrors":
         """Draw the errors that remain after a calibration."""
         return cls(calibration, calibration.pose_sigma_m * rng.standard_normal(3),
                    calibration.pose_sigma_rad * rng.standard_normal(3),
@@ -77,7 +69,7 @@ class CellErrors:
                 "camera_place_m": self.camera_offset.tolist(),
                 "camera_turn_rad": self.camera_turn.tolist()}
 
-    def recorded(self, pull: Pull, rng: np.random.Generator) -> Pull:
+    def recorded(self, pull: recording.Pull, rng: np.random.Generator) -> recording.Pull:
         """Record an exact pull with this cell and a zero and drift of its own, without noise. The
         gripper's frame turns about ``pivot`` [3], if none is set the first pull's grasp, the
         observer's about the centre of the points at rest."""
@@ -218,7 +210,7 @@ def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random
 
 
 def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
-                  progress: Progress = SILENT) -> tuple[Pull, list[np.ndarray]]:
+                  progress: Progress = SILENT) -> tuple[recording.Pull, list[np.ndarray]]:
     """Pull the true branch and measure it; returns the pull and the true displacements [m].
 
     Raises:
@@ -236,16 +228,16 @@ def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
         made = _rod(truth, settings, is_weightless).pulled(requested, progress=progress)
         positions, displacements = made.seen(points), []
     else:
-        grasp = grasp_on(truth.mesh, entry.grasp)
+        grasp = recording.grasp_on(truth.mesh, entry.grasp)
         made = moved(model.gripped(grasp), grasp, requested, progress=progress)
         displacements = made.displacements
         positions = seen_at(points, truth.mesh, displacements)
     sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
              for part in (slice(0, 3), slice(3, 6))]
     wrenches, count, poses = made.wrenches.copy(), len(made.wrenches), made.poses
-    if settings.calibration != EXACT:
-        exact = Pull(name, entry, settings.times, poses, wrenches,
-                     Observations(settings.times, positions))
+    if settings.calibration != recording.EXACT:
+        exact = recording.Pull(name, entry, settings.times, poses, wrenches,
+                     recording.Observations(settings.times, positions))
         entry, poses, wrenches, positions = _misread(exact, shifts, settings, truth)
     wrenches[:, :3] += settings.force_noise * sizes[0] * rng.standard_normal((count, 3))
     positions = positions + settings.position_noise * rng.standard_normal(positions.shape)
@@ -253,15 +245,15 @@ def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
     positions[stray] += 0.05 * rng.standard_normal((int(stray.sum()), 3))
     wrenches[:, 3:] += settings.torque_noise * sizes[1] * rng.standard_normal((count, 3))
     torque_sigma = max(settings.torque_noise, 2e-3) * sizes[1]
-    entry = entry.model_copy(update={"sensor": SensorEntry(
+    entry = entry.model_copy(update={"sensor": recording.SensorEntry(
         position_sigma_m=max(settings.position_noise, 1e-4),
         force_sigma_n=max(settings.force_noise, 2e-3) * sizes[0],
         torque_sigma_nm=torque_sigma if settings.mode == "rigid" and torque_sigma > 0 else None)})
-    observations = None if settings.camera else Observations(settings.times, positions)
-    return Pull(name, entry, settings.times, poses, wrenches, observations), displacements
+    observations = None if settings.camera else recording.Observations(settings.times, positions)
+    return recording.Pull(name, entry, settings.times, poses, wrenches, observations), displacements
 
 
-def _requested(truth: TrueBranch, settings: PullSpec, entry: PullEntry,
+def _requested(truth: TrueBranch, settings: PullSpec, entry: recording.PullEntry,
                phase: float) -> MotionWanted:
     point = np.array(entry.grasp.point_m)
     arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
@@ -298,8 +290,8 @@ def _marked(truth: TrueBranch, settings: PullSpec) -> tuple[np.ndarray, np.ndarr
     return shifts, points
 
 
-def _misread(exact: Pull, shifts: np.ndarray, settings: PullSpec, truth: TrueBranch,
-             ) -> tuple[PullEntry, np.ndarray, np.ndarray, np.ndarray]:
+def _misread(exact: recording.Pull, shifts: np.ndarray, settings: PullSpec, truth: TrueBranch,
+             ) -> tuple[recording.PullEntry, np.ndarray, np.ndarray, np.ndarray]:
     """Return entry, poses, wrenches and positions as a cell with errors records them."""
     if settings.camera:
         raise InputError(Text(Option("camera"), " cannot be combined with errors of the cell."),
@@ -339,7 +331,7 @@ def _kind(settings: PullSpec,
     return "turned" if settings.mode == "rigid" and settings.drive == "pose" else "pull"
 
 
-def _entry(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> PullEntry:
+def _entry(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> recording.PullEntry:
     point = truth.skeleton.point_at(settings.grasp_fraction)
     radius = truth.skeleton.radius_at(settings.grasp_fraction)
     known = {"young_pa": truth.young.tolist(), "poisson": settings.poisson,
@@ -348,21 +340,21 @@ def _entry(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> PullEn
              "control_points_m": truth.control_points.tolist(),
              "tet_count": truth.mesh.tet_count, "seed": settings.seed,
              "assumed": truth.is_assumed}
-    return PullEntry(
+    return recording.PullEntry(
         observation="depth" if settings.camera else "markers",
         drive="force" if settings.weight is not None else settings.drive,
-        motion=settings.motion, calibration=EXACT,
+        motion=settings.motion, calibration=recording.EXACT,
         gravity_m_s2=truth.gravity if settings.own_weight and not is_weightless else None,
         weightless=is_weightless,
-        grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),
+        grasp=recording.GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),
                          mode=settings.mode),
         rest_points_m=None if settings.camera else tuple(
             tuple(map(float, p)) for p in truth.control_points),
         source="limber virtual-pull", truth=known)
 
 
-def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, displacements: list[np.ndarray],
-                       settings: PullSpec) -> None:
+def write_depth_frames(folder: Path, truth: TrueBranch, pull: recording.Pull,
+                       displacements: list[np.ndarray], settings: PullSpec) -> None:
     """Write simulated D455 depth images of a pull: ``depth/`` and ``camera.toml``."""
     camera = viewing(truth.mesh.nodes, displacements)
     write_camera(folder / "camera.toml", camera)

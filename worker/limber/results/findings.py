@@ -46,33 +46,33 @@ def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
     """Return the moduli from base to tip with their intervals [Pa], None where open; ``assumed``:
     what the reader must know first, empty for a real pull."""
     intervals = estimate.get("young_interval_pa") or [None] * len(estimate["young_pa"])
-    values = [_with_interval(young, interval) for young, interval in zip(
+    told = [(young, _with_interval(young, interval)) for young, interval in zip(
         estimate["young_pa"], intervals, strict=True)]
-    words = "from base to tip"
-    if len(values) > _MOST_NAMED:
-        order = sorted(range(len(values)), key=lambda k: estimate["young_pa"][k])
-        values = [values[order[0]], values[order[-1]]]
+    words = "from base to tip" if estimate.get("converged", True) else "so far"
+    if len(told) > _MOST_NAMED:
+        told = sorted(told)[::len(told) - 1]
         words = "between the lowest and the highest control point"
-    return (f"Young's modulus {words}: {', '.join(values)} MPa (95 % intervals"
+    return (f"Young's modulus {words}: {', '.join(each for _, each in told)} MPa (95 % intervals"
             f"{f'; {assumed}' if assumed else ''}).")
 
 
 def telling_sentence(estimate: Mapping[str, Any]) -> str:
     """Return which of E and E I the pulls tell, to how much, and what that is good for."""
+    if not estimate.get("converged", True):
+        return "The fit has not ended: these pulls tell nothing yet."
     wide = sorted((max(log(each[1] / each[0]) / 2 if each and all(each) else inf
                        for each in estimate[key]), name)
                   for key, name in (("young_interval_pa", "Young's modulus E"),
                                     ("bending_stiffness_interval_nm2", "the bending stiffness E I"))
                   if estimate.get(key))
     best, worst = wide[0][0], wide[-1][0]
-    use = next(use for limit, use in _USES if best <= limit)
     both = ("" if len(wide) < 2 else " Both follow alike." if best > 0.8 * worst else
             " The rest of E's uncertainty is the radius of the scan. Forces, energies and plans "
             "need E I alone.")
     told = " and ".join(
         f"{name} with no limit" if size == inf else f"{name} to within a factor of {exp(size):.2g}"
         if size > 0.5 else f"{name} to within {100 * size:.0f} %" for size, name in wide)
-    return f"These pulls tell {told}: {use}.{both}"
+    return f"These pulls tell {told}: {next(use for limit, use in _USES if best <= limit)}.{both}"
 
 
 _USES = ((0.2, "good for plans and forces"), (0.5, "good for plans, and for forces with a margin"),

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import Cancelled
+from limber.core.errors import Cancelled, WorkError
 from limber.core.json_values import json_object
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
@@ -138,29 +138,26 @@ class EvaluationEntry:
 class EvaluationLog:
     """Appends one JSON line per evaluation, and reads those of an earlier run.
 
-    The first line has a digest of the problem; evaluations of another problem are not reused.
+    The first line has a digest of the problem; evaluations of another problem are not reused, and
+    those of a stopped run only if this one ``resumes``.
     """
 
-    def __init__(self, path: Path | None, problem: str):
+    def __init__(self, path: Path | None, problem: str, *, resumes: bool = True):
         self.entries: list[EvaluationEntry] = []
         self.resumed_count = 0
-        self._known: dict[bytes, EvaluationEntry] = {}
+        self._known: list[EvaluationEntry] = []
         self._path = path
         self._started = time.perf_counter()
-        self._problem = problem
+        self._header: dict[str, str | bool] = {"problem": problem}
         if path is not None:
-            self._resume(path)
+            self._resume(path, resumes)
 
     @property
     def best(self) -> EvaluationEntry | None:
         """The entry of the smallest objective; None: no evaluation had an equilibrium."""
         found = [(entry.objective, number, entry) for number, entry in enumerate(
-            [*self.entries, *self._known.values()]) if entry.objective is not None]
+            [*self.entries, *self._known]) if entry.objective is not None]
         return min(found)[2] if found else None
-
-    def find(self, parameters: np.ndarray) -> EvaluationEntry | None:
-        """Return the entry of an earlier run with exactly these parameters."""
-        return self._known.get(_key(parameters))
 
     def add(self, parameters: np.ndarray, objective: float | None, loss: float | None) -> None:
         """Add an evaluation. Its line is on disk when this returns."""
@@ -171,30 +168,50 @@ class EvaluationLog:
             with open(self._path, "a", encoding="utf-8") as stream:
                 stream.write(json.dumps(entry.__dict__) + "\n")
 
+    def go_on_from(self, best: "Evaluation") -> None:
+        """Let the next run start at this evaluation, whether it is asked to or not."""
+        self._header["goes_on"] = True
+        if self._path is not None:
+            self._begin(self._path)
+            self.add(best.free, best.objective, best.loss)
+
     def forget(self) -> None:
         """Remove the file after the estimate."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
 
-    def _resume(self, path: Path) -> None:
+    def _begin(self, path: Path) -> None:
+        path.write_text(json.dumps(self._header) + "\n", encoding="utf-8")
+
+    def _resume(self, path: Path, resumes: bool) -> None:
         lines = (path.read_text(encoding="utf-8", errors="replace").splitlines()
                  if path.exists() else [])
         header = json_object(lines[0]) if lines else None
-        if header is None or header.get("problem") != self._problem:
-            path.write_text(json.dumps({"problem": self._problem}) + "\n", encoding="utf-8")
+        if header is None or not (resumes or header.get("goes_on")) or header.get(
+                "problem") != self._header["problem"]:
+            self._begin(path)
             return
         for line in lines[1:]:
             record = json_object(line) or {}
             try:
-                entry = EvaluationEntry(**(record | {"parameters": tuple(record["parameters"])}))
-                self._known[_key(np.array(entry.parameters))] = entry
+                self._known.append(EvaluationEntry(
+                    **(record | {"parameters": tuple(record["parameters"])})))
             except (KeyError, TypeError, ValueError):
                 continue  # a damaged line: repeat that evaluation
         self.resumed_count = len(self._known)
 
 
-def _key(parameters: np.ndarray) -> bytes:
-    return np.asarray(parameters, float).tobytes()
+WORK_LIMIT = 4.5e6
+"""Tetrahedra times linear systems after which a fit ends, the same on every machine: 40 to 65 s of
+processor time, so that an estimate takes about a minute with what judges it.
+"""
+
+
+class Work:
+    """A share of the limit, and what is ``left`` of it."""
+
+    def __init__(self, share: float = 1.0):
+        self.left = share * WORK_LIMIT
 
 
 SETTLING_ROUNDS = 12
@@ -205,6 +222,10 @@ larger linear step overshoots.
 STILL_SETTLING = 0.6
 """A change of the force diverges if it moves the gripper by more than this fraction of the last
 one.
+"""
+LINEAR_STEP = 0.02
+"""Change of a log E within which no simulation shows more than derivatives: these change by two
+percent.
 """
 FORESEEN_STEP = 0.5
 """Largest change of a log E over which the force is foreseen by derivatives. Chosen: beyond it the
@@ -274,8 +295,9 @@ class Objective:
 
     def __init__(self, forwards: list[Forward], space: ParameterSpace, *,
                  log: EvaluationLog | None = None, force_sigma: list[float] | None = None,
-                 progress: Progress = SILENT, expected_count: int = 20):
+                 progress: Progress = SILENT, expected_count: int = 20, work: Work | None = None):
         self.forwards = forwards
+        self.work = work or Work()
         self.space = space
         self.log = log or EvaluationLog(None, "")
         self.forward_count = 0
@@ -295,7 +317,7 @@ class Objective:
         the same log and count."""
         other = Objective(forwards or self.forwards, space, log=self.log,
                           force_sigma=self.force_sigma, progress=self._progress,
-                          expected_count=self._expected)
+                          expected_count=self._expected, work=self.work)
         other.forward_count, other.variance = self.forward_count, self.variance
         return other
 
@@ -321,6 +343,11 @@ class Objective:
             return last
         values = self.space.unpack(free)
         young = _listed(values)
+        if self.work.left <= 0 and self.log.best is None:
+            raise WorkError(
+                "The fit has spent its budget before it found an equilibrium.", "No Young's "
+                f"modulus of the {len(self.log.entries)} tested carries this pull.", "Check the "
+                "grasp point, the frame of reference and the units, or mesh the branch coarser.")
         try:
             found = self._simulated(free, values, jacobian)
             if last is None or not np.array_equal(last.free, free):
@@ -413,23 +440,38 @@ class Objective:
         """Changes of settling forces from the last derivatives to ``free``; empty: too far."""
         if self._linear is None:
             return {}
-        at, pulls = self._linear
-        step, count = free - at, self.space.group_count
-        known = self.space.unpack(at)
-        if np.abs(step[:count]).max() > FORESEEN_STEP or not all(
+        known, step = self.space.unpack(self._linear[0]), free - self._linear[0]
+        if np.abs(step[:self.space.group_count]).max() > FORESEEN_STEP or not all(
                 forward.is_settled_for(known) for forward in settling.values()):
             return {}
-        step = np.r_[self.space.membership @ step[:count], step[count:]]
-        found = self.compare(free, [pull.moved(present(pull.slopes, "derivatives"), step)
-                                    for pull in pulls])
+        found = self._extrapolated(self._linear, step)
         return {index: self._residuals[index].force_change(found.pulls[index])
                 for index in settling}
+
+    def _extrapolated(self, linear: tuple[np.ndarray, list[Simulated]], step: np.ndarray,
+                      ) -> Evaluation:
+        at, pulls = linear
+        count = self.space.group_count
+        wide = np.r_[self.space.membership @ step[:count], step[count:]]
+        return self.compare(at + step, [
+            replace(pull.moved(slopes := present(pull.slopes, "derivatives"), wide), slopes=slopes)
+            for pull in pulls])
+
+    def moved(self, at: Evaluation, step: np.ndarray) -> Evaluation | None:
+        """Evaluate at a step from an evaluation with derivatives: by these if it is short."""
+        free = np.clip(at.free + step, *self.space.bounds())
+        if self._linear is None or not np.array_equal(at.free, self._linear[0]) or np.abs(
+                step[:self.space.group_count]).max() > LINEAR_STEP:
+            return self.evaluate(free, jacobian=True)
+        self._last = self._extrapolated(self._linear, free - at.free)
+        return self._last
 
     def _compared(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
         pulls = []
         for forward in self.forwards:
             self._report("simulating", young_mpa=_listed(values))
             found = forward.simulate(values, self.space.extra, jacobian)
+            self.work.left -= forward.work
             if found is None:
                 return None
             pulls.append(found)

@@ -1,7 +1,7 @@
 """The optimisers: the paper's Nelder-Mead, and Gauss-Newton with exact sensitivities."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -12,8 +12,9 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 
 EVALUATION_LIMIT = 400
 """Forward simulations of all pulls, after which a fit that still moves is given up."""
-FIRST_DAMPING, MOST_DAMPING = 0.02, 1e3
-"""Damping, over the squares of the slopes, of a step tried again; above the last, none descends."""
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-3, 0.02, 1e3
+"""Damping, over the squares of the slopes: of a step tried again the second; under the first none
+is left, above the last no step descends."""
 LONGEST_STEP = 1.1
 """Longest step of Gauss-Newton in a log E, a factor of three: beyond it no linearisation holds."""
 OUTLYING = 3.0
@@ -26,13 +27,12 @@ SETTLED_FALL = 0.01
 UNSETTLED_FALL = 0.03
 """Fall of the cost that states settled to half a millimetre do not show: a quarter of a deviation.
 """
-SETTLED_STEP = 0.005
-"""Length of the remaining step, in standard deviations, at which Gauss-Newton ends."""
-WANDERING_STEP = 0.1
-"""The same if forces are settled in every simulation: to half a millimetre of the gripper's
-position, whose repeatability is no better; a stricter end does not converge. The remainder adds
-half a percent to the deviation.
+SETTLED_STEP = 0.2
+"""Length of the remaining step, in standard deviations, at which Gauss-Newton ends. It is taken
+with the last simulation of a fit; elsewhere it adds two percent to the deviation.
 """
+LEAST_NOISE = 0.025
+"""Noise over the stated one below which no simulation shows a shorter step."""
 FIRST_SIMPLEX = 0.5
 """Step of Nelder-Mead's first simplex in log E: a factor of 1.6. With 1 it finds the paper's young
 branch as fast.
@@ -50,33 +50,42 @@ class FitStatus(StrEnum):
 
     converged: by the optimiser's own criterion.
     out_of_evaluations: no more simulations were allowed.
+    out_of_work: its budget was spent; another fit goes on from there.
     misfit: it settled, but farther from the measurements than requested.
     stopped: by the user.
     """
 
     converged = "converged"
     out_of_evaluations = "out of evaluations"
+    out_of_work = "out of budget"
     misfit = "misfit"
     stopped = "stopped"
 
 
 @dataclass(frozen=True)
 class Fit:
-    """End of an optimiser: the best evaluation, with derivatives if requested, and the reason as
-    text with numbers."""
+    """End of an optimiser: the best evaluation, with derivatives if requested, the reason as text
+    with numbers, and the step [p] that it would have taken next."""
 
     evaluation: Evaluation
     status: FitStatus
     reason: str
+    left: np.ndarray | None = None
 
     @property
     def converged(self) -> bool:
         return self.status is FitStatus.converged
 
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether the user or the budget ended it on its way."""
+        return self.status in (FitStatus.stopped, FitStatus.out_of_work)
+
 
 def gauss_newton(objective: Objective, start: np.ndarray, *,
-                 evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
-                 force_rounds: int = FORCE_ROUNDS, shortest: float = SETTLED_STEP) -> Fit:
+                 evaluation_limit: int = EVALUATION_LIMIT, tolerance: float = 3e-5,
+                 is_near: bool = False, force_rounds: int = FORCE_ROUNDS,
+                 shortest: float = SETTLED_STEP) -> Fit:
     """Levenberg-Marquardt within bounds, at most threefold in a modulus a step. In the end
     residuals beyond ``OUTLYING`` count linearly (soft l1). It ends at a relative change
     ``tolerance`` of the cost or a step ``shortest`` in deviations. WorkError if the start has no
@@ -90,14 +99,29 @@ def gauss_newton(objective: Objective, start: np.ndarray, *,
         at = end.evaluation
     for _ in range(force_rounds):
         # Measured input forces are now known better, and so is their effect on the points.
-        if not objective.follow_forces(at):
+        if end.status is FitStatus.out_of_work or not objective.follow_forces(at):
             break
         before = _required(objective, at.free)
         end = search.minimised(before, *phases[-1])
         at = end.evaluation
         if np.linalg.norm(before.slopes @ (at.free - before.free)) < FORCE_SETTLED:
             break
-    return Fit(_required(objective, at.free), end.status, end.reason)
+    return replace(end, evaluation=_required(objective, at.free))
+
+
+def own_weights(found: Evaluation, objective: Objective) -> np.ndarray:
+    """Weights of the rows: the noisier the measurements, the more the priors count, [r]."""
+    weights, count = np.ones(len(found.residual)), objective.space.own_row_count
+    weights[len(weights) - count:] = objective.variance**0.5
+    return weights
+
+
+def cost_of(found: Evaluation, objective: Objective, *, robust: bool = True) -> float:
+    """What Gauss-Newton minimises."""
+    squares = found.residual**2
+    if robust:
+        squares = 2 * OUTLYING**2 * (np.sqrt(1 + squares / OUTLYING**2) - 1)
+    return 0.5 * float(squares @ own_weights(found, objective)**2)
 
 
 class _Search:
@@ -107,8 +131,8 @@ class _Search:
     def __init__(self, objective: Objective, evaluation_limit: int, shortest: float):
         self._objective, self._limit = objective, evaluation_limit
         self._lower, self._upper = objective.space.bounds()
-        settles = any(forward.watches_pose for forward in objective.forwards)
-        self._shortest = max(WANDERING_STEP if settles else 0.0, shortest)
+        # Of the noise that there is: measurements may be better than stated.
+        self._shortest = shortest * np.clip(objective.variance**0.5, LEAST_NOISE, 1.0)
 
     def inside(self, free: np.ndarray) -> np.ndarray:
         """The vector within the bounds."""
@@ -117,28 +141,27 @@ class _Search:
     def minimised(self, at: Evaluation, robust: bool, ending: float) -> Fit:
         """Descend from an evaluation to a relative change of cost."""
         def cost(found: Evaluation) -> float:
-            squares = found.residual**2
-            if robust:
-                squares = 2 * OUTLYING**2 * (np.sqrt(1 + squares / OUTLYING**2) - 1)
-            return 0.5 * float(squares @ self._own_weights(found)**2)
+            return cost_of(found, self._objective, robust=robust)
 
-        damping = least = 0.0
+        damping = 0.0
         for _ in range(self._limit):
-            weight = self._own_weights(at)
+            weight = own_weights(at, self._objective)
             if robust:
                 weight = weight * (1 + (at.residual / OUTLYING)**2)**-0.25
             slopes, residual = weight[:, None] * at.slopes, weight * at.residual
-            step = self._step(at.free, slopes, residual, damping)
-            length = float(np.linalg.norm(slopes @ step))
+            full = self._step(at.free, slopes, residual, 0.0)
+            length = float(np.linalg.norm(slopes @ full))
             if length < self._shortest:
                 return Fit(at, FitStatus.converged, "The next step is shorter than "
-                           f"{self._shortest:g} standard deviations.")
+                           f"{self._shortest:.2g} standard deviations.", full)
+            if self._objective.work.left <= 0:
+                return Fit(at, FitStatus.out_of_work, f"Its budget was spent {length:.2g} standard "
+                           "deviations from where it was going.", full)
+            step = self._step(at.free, slopes, residual, damping) if damping else full
             longest = float(np.abs(step[:self._objective.space.group_count]).max())
             step *= min(1.0, LONGEST_STEP / max(longest, 1e-12))
             tried = self._objective.evaluate(at.free + step, jacobian=True)
             fall = -np.inf if tried is None else cost(at) - cost(tried)
-            # Where full steps lead out of equilibrium, the next one would too.
-            least = FIRST_DAMPING / 8 if tried is None else least
             foreseen = 0.5 * float(residual @ residual - np.sum((residual + slopes @ step)**2))
             if tried is None or fall <= 0:
                 # Too little was to be gained.
@@ -147,19 +170,14 @@ class _Search:
                     return Fit(at, FitStatus.converged, "No step descends.")
                 damping = max(FIRST_DAMPING, 8 * damping)
                 continue
-            damping = least if damping < FIRST_DAMPING else (
+            # Where a full step failed, the next one would too.
+            damping = 0.0 if damping < LEAST_DAMPING else (
                 damping / 8 if fall > 0.25 * foreseen else 2 * damping)
             was, at = cost(at), tried
             if fall < ending * was:
                 return Fit(at, FitStatus.converged, f"The last step changed the cost by less than "
                            f"{ending:g} of it.")
         return Fit(at, FitStatus.out_of_evaluations, f"{self._limit} simulations were not enough.")
-
-    def _own_weights(self, found: Evaluation) -> np.ndarray:
-        """Weights of the rows: the noisier the measurements, the more the priors count, [r]."""
-        weights, count = np.ones(len(found.residual)), self._objective.space.own_row_count
-        weights[len(weights) - count:] = self._objective.variance**0.5
-        return weights
 
     def _step(self, free: np.ndarray, slopes: np.ndarray, residual: np.ndarray, damping: float,
               ) -> np.ndarray:
@@ -196,7 +214,7 @@ def nelder_mead(objective: Objective, start: np.ndarray, *,
 
     def cost(free: np.ndarray) -> float:
         rule.count += 1
-        found = objective.log.find(free) or objective.evaluate(free)
+        found = objective.evaluate(free)
         if found is None or found.objective is None or found.loss is None:
             # The simplex only asks which of its corners is worse.
             return np.inf
@@ -318,12 +336,10 @@ def _required(objective: Objective, free: np.ndarray) -> Evaluation:
 def best_so_far(objective: Objective) -> Fit:
     """Return the best evaluation of a stopped fit. Cancelled if there is no evaluation yet."""
     best = objective.log.best
-    if best is None or len(best.parameters) != objective.space.size:
-        raise Cancelled("The estimate was stopped before the first step of the fit.",
-                        "There is no result to keep yet.", "Run it again.")
     quiet = Objective(objective.forwards, objective.space, force_sigma=objective.force_sigma)
-    evaluation = quiet.evaluate(np.array(best.parameters), jacobian=True)
+    evaluation = None if best is None or len(best.parameters) != objective.space.size else (
+        quiet.evaluate(np.array(best.parameters), jacobian=True))
     if evaluation is None:
         raise Cancelled("The estimate was stopped before it found an equilibrium.",
                         "There is no result to keep yet.", "Run it again.")
-    return Fit(evaluation, FitStatus.stopped, "stopped")
+    return Fit(evaluation, FitStatus.stopped, "It was stopped.")

@@ -274,7 +274,7 @@ def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int,
                 np.mean(np.clip(each, -CLIPPED, CLIPPED)**2) < COURSE_MISFIT * max(
                     1 - len(keys) / len(each), 1 / len(each)) for each in beside):
             return Course(keys, spread, values)
-        count = 2 * len(keys)
+        count = len(keys) + len(keys) // 4 + 1
 
 
 def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndarray,
@@ -394,6 +394,9 @@ class Forward(ABC):
 
     skeleton: Skeleton | None = None
     """Axes of the branch, if known: a fit starts from a beam along them."""
+
+    work = 0.0
+    """What the last simulation took, in tetrahedra times linear systems."""
 
     creep_time: float | None = None
     """Time constant of the branch's creep [s], if its share is an unknown of the fit."""

@@ -6,23 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from limber.core.errors import InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.estimation.forward.forward_model import (
-    Course,
-    Forward,
-    Simulated,
-    compliance,
-    course_of,
-    key_frames,
-    motion_response,
-    nodal_loads,
-    response_of,
-    travel,
-    wrench_sigma,
-)
+from limber.estimation.forward import forward_model as base
 from limber.estimation.parameters import Values, YoungField, equal_values, mechanics_names
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig
@@ -109,7 +98,7 @@ class Lumping:
     twigs: Sequence[HungTwig]
 
 
-class QuasiStaticForward(Forward):
+class QuasiStaticForward(base.Forward):
     """Simulates one pull in equilibrium, at most at ``key_count`` frames. Their states are kept:
     parameters change little, so two Newton steps are enough. ``weights`` [tet_count, K] map moduli
     to tetrahedra, unless ``field`` does."""
@@ -131,6 +120,7 @@ class QuasiStaticForward(Forward):
         self.uses_torque = uses_torque(entry, frames)
         self.spread = np.empty((len(frames), 0))
         self._memory: list[_Memory | None] = []
+        self._last: tuple | None = None
         self.iteration_count = 0
         self.set_key_count(key_count)
 
@@ -138,17 +128,19 @@ class QuasiStaticForward(Forward):
         """Simulate at most ``count`` frames from now on; more if the force needs them."""
         frames, earlier = self.frames, self.spread
         states = [memory.displacement for memory in self._memory if memory is not None]
-        self._course: Course | None = None
+        self._course: base.Course | None = None
         self.response = None
         if self.drive == "pose":
-            self.keys, self.spread = key_frames(travel(frames.poses), count)
+            self._along = base.travel(frames.poses)
+            self.keys, self.spread = base.key_frames(self._along, count)
             self._drives = [pose_on(self.grasp, self.entry.grasp, pose)
                             for pose in frames.poses[self.keys]]
         else:
             components = 6 if self.uses_torque else 3
-            sigma = wrench_sigma(self.entry, frames, components)
-            self._course = course_of(frames, sigma, count, components,
+            sigma = base.wrench_sigma(self.entry, frames, components)
+            self._course = base.course_of(frames, sigma, count, components,
                                      self.pose_sigma if self.watches_pose else np.inf)
+            self._along = frames.times
             self.keys, self.spread = self._course.keys, self._course.spread
             self._measured = self._course.values
             self._drives = list(self._measured)
@@ -182,17 +174,24 @@ class QuasiStaticForward(Forward):
         return self._model
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
-                 ) -> Simulated | None:
+                 ) -> base.Simulated | None:
+        is_asked = (sensitivities or self.watches_pose) and self.response is None and (
+            self.has_force_unknowns)
+        self.iteration_count, self.work = 0, 0.0
+        # What changes the model or the drives replaces these objects.
+        if self._last is not None and not is_asked and equal_values(self._values, values):
+            model, drives, names, known = self._last
+            if (model is self._model and drives is self._drives
+                    and self.uses_torque == (known.torques is not None)
+                    and (not sensitivities or (names == extra and known.slopes is not None))):
+                return known
         model = self.model_with(values)
         jump = None if self._values is None else np.log(values.young) - np.log(self._values.young)
         size = len(self.keys), len(self.rest_points), self.uses_torque
-        found, slopes = Simulated.empty(*size), Simulated.empty(
+        found, slopes = base.Simulated.empty(*size), base.Simulated.empty(
             *size, len(values.young) + len(extra))
         states: list[_Memory | None] = []
         before: np.ndarray | None = None
-        is_asked = (sensitivities or self.watches_pose) and self.response is None and (
-            self.has_force_unknowns)
-        self.iteration_count = 0
         compliances: list[np.ndarray] = []
         for key, memory in enumerate(self._memory):
             is_known = memory is not None and equal_values(self._values, values)
@@ -206,7 +205,7 @@ class QuasiStaticForward(Forward):
             self._enter(found, key, result)
             # While the factorisation of this state is available.
             if is_asked:
-                compliances.append(compliance(model, before, self._loads[key]))
+                compliances.append(base.compliance(model, before, self._loads[key]))
             if sensitivities:
                 slope = self._enter_slopes(slopes, key, model, values, extra, result)
             states.append(_Memory(result, slope))
@@ -218,9 +217,11 @@ class QuasiStaticForward(Forward):
             self.response = self._response(compliances)
         found = replace(found, grasps=self._grasps(), slopes=replace(
             slopes, grasps=self._grasp_slopes()) if sensitivities else None)
-        return found.each(lambda at_keys: np.tensordot(self.spread, at_keys, axes=1))
+        found = found.each(lambda at_keys: np.tensordot(self.spread, at_keys, axes=1))
+        self._last = (self._model, self._drives, extra, found)
+        return found
 
-    def _enter(self, found: Simulated, key: int, result: StaticResult) -> None:
+    def _enter(self, found: base.Simulated, key: int, result: StaticResult) -> None:
         drive = self._drives[key]
         found.positions[key] = self.rest_points + self._observed(result.displacement)
         found.forces[key] = result.reaction_force if self.drive == "pose" else drive[:3]
@@ -231,7 +232,7 @@ class QuasiStaticForward(Forward):
             arm = drive[:3] - self.frames.poses[self.keys[key], :3]
             found.torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
 
-    def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
+    def _enter_slopes(self, found: base.Simulated, key: int, model: BranchModel, values: Values,
                       extra: tuple[str, ...], result: StaticResult) -> np.ndarray | None:
         """Enter the derivatives; return that of the displacement [n, 3, p], if it is known."""
         slope, found.forces[key] = self._slopes(model, values, extra, result)
@@ -271,13 +272,13 @@ class QuasiStaticForward(Forward):
     def _off_readings(self) -> np.ndarray:
         return (self._measured - np.array(self._drives)).ravel()
 
-    def _response(self, compliances: list[np.ndarray]) -> Simulated:
+    def _response(self, compliances: list[np.ndarray]) -> base.Simulated:
         self._compliances = compliances
-        return response_of(self.spread, np.array(
+        return base.response_of(self.spread, np.array(
             [[self._observed(moved) for moved in each] for each in compliances]))
 
     def _loads_at(self, frame: int) -> np.ndarray:
-        return nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[frame],
+        return base.nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[frame],
                            self._model.mesh.nodes, 6 if self.uses_torque else 3)
 
     def load_at(self, key: int) -> np.ndarray:
@@ -362,19 +363,27 @@ class QuasiStaticForward(Forward):
                             "fit.", "It was found from another state during the fit.",
                             "Omit ", Option("quick"), ", or use fewer control points (",
                             Option("fractions"), ").")
-        model, worst = self.model_with(values), 0.0
         states = [state.displacement for state in self.states()]
-        for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):
-            middle = (first + second) // 2
-            if middle in (first, second):
-                continue
-            between = np.tensordot(self.spread[middle], states, axes=1)
-            result = self._solve(model, self._load_between(middle), between)
-            if result is not None:
-                exact = self.rest_points + self._observed(result.displacement)
-                off = np.linalg.norm(exact - known.positions[middle], axis=1)
-                worst = max(worst, float(off.max()))
-        return worst
+        if (middle := self._least_known()) is None:
+            return 0.0
+        result = self._solve(self.model_with(values), self._load_between(middle),
+                             np.tensordot(self.spread[middle], states, axes=1))
+        exact = known.positions[middle] if result is None else (
+            self.rest_points + self._observed(result.displacement))
+        return float(np.linalg.norm(exact - known.positions[middle], axis=1).max())
+
+    def _least_known(self) -> int | None:
+        """The frame halfway between those two key frames that a spline through the others foretells
+        worst; None: every frame is one."""
+        seen = np.array([self._observed(state.displacement).ravel() for state in self.states()])
+        at, off = self._along[self.keys], np.zeros(len(self.keys))
+        for key in range(1, len(at) - 1):
+            others = scipy.interpolate.CubicSpline(np.delete(at, key), np.delete(seen, key, 0))
+            off[key] = np.linalg.norm(others(at[key]) - seen[key])
+        off[[0, -1]] = off[[1, -2]]
+        return max(((off[k] + off[k + 1], int(first + second) // 2) for k, (first, second) in
+                    enumerate(zip(self.keys[:-1], self.keys[1:], strict=True))
+                    if second - first > 1), default=(0.0, None))[1]
 
     def _load_between(self, frame: int) -> np.ndarray:
         if self.drive == "pose":
@@ -394,6 +403,8 @@ class QuasiStaticForward(Forward):
         result = solve_static(model, start=start, settings=replace(
             settings, total_iterations=min(settings.total_iterations, left)), **loads)
         self.iteration_count += result.iterations
+        # It begins with a step along the tangent, and ends with a test of stability.
+        self.work += float(self.mesh.tet_count * (result.iterations + 2))
         return result if result.converged else None
 
     def _solved(self, model: BranchModel, key: int, jump: np.ndarray | None,
@@ -431,7 +442,7 @@ class QuasiStaticForward(Forward):
 
 # A fast pull, simulated over time with inertia and damping.
 
-class DynamicForward(Forward):
+class DynamicForward(base.Forward):
     """Simulates one pull by Newmark steps. Arguments as for
     :class:`limber.estimation.forward.solved_pull.QuasiStaticForward`. Every frame is simulated."""
 
@@ -454,6 +465,8 @@ class DynamicForward(Forward):
                 'mode = "point" under [grasp] in pull.toml.')
         self._forces = frames.wrenches[:, :3]
         self._arguments = (name, model, weights, entry)
+        steps = np.ceil(np.diff(frames.times) / NewmarkSettings().max_step).sum()
+        self.work = float(model.mesh.tet_count * steps)
         # Only the nodes that determine the observed points need derivatives.
         self._nodes = np.unique(self._operator.indices // 3)
         columns = (3 * self._nodes[:, None] + np.arange(3)).ravel()
@@ -464,7 +477,7 @@ class DynamicForward(Forward):
         return self.drive == "force"
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
-                 ) -> Simulated | None:
+                 ) -> base.Simulated | None:
         model = self.model_with(values)
         frames, by_pose = self.frames, self.drive == "pose"
         drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
@@ -485,7 +498,7 @@ class DynamicForward(Forward):
                                               for each in result.displacement])
         forces = result.reaction_force if by_pose else self._forces
         if not sensitivities:
-            return Simulated(positions, forces)
+            return base.Simulated(positions, forces)
         if self.response is None and not by_pose:
             self.response = self._response(model)
         slopes = present(result.sensitivities, "derivative of the motion")
@@ -497,7 +510,7 @@ class DynamicForward(Forward):
         flat = slopes.displacement.reshape(len(frames), -1, count)
         d_positions = np.stack([(self._near @ frame).reshape(-1, 3, count) for frame in flat])
         d_forces = slopes.reaction_force if by_pose else np.zeros((len(frames), 3, count))
-        return Simulated(positions, forces, slopes=Simulated(d_positions * scale,
+        return base.Simulated(positions, forces, slopes=base.Simulated(d_positions * scale,
                                                              d_forces * scale))
 
     def until(self, count: int) -> "DynamicForward":
@@ -522,9 +535,9 @@ class DynamicForward(Forward):
     def _off_readings(self) -> np.ndarray:
         return (self.frames.wrenches[:, :3] - self._forces).ravel()
 
-    def _response(self, model: BranchModel) -> Simulated:
-        loads = nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[0],
+    def _response(self, model: BranchModel) -> base.Simulated:
+        loads = base.nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[0],
                             model.mesh.nodes, 3)
         count = len(self.frames)
-        points = motion_response(model, loads, self._operator, self.frames.times)
-        return Simulated(points, np.eye(3 * count).reshape(count, 3, 3 * count))
+        points = base.motion_response(model, loads, self._operator, self.frames.times)
+        return base.Simulated(points, np.eye(3 * count).reshape(count, 3, 3 * count))

@@ -28,13 +28,8 @@ from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.recording import GraspEntry, grasp_on, pose_on
+from limber.reduced import reduced_model
 from limber.reduced.model_cache import reduce_snapshots
-from limber.reduced.reduced_model import (
-    ReducedModel,
-    ReducedSettings,
-    ReducedState,
-    ReducedStaticSettings,
-)
 from limber.reduced.training import Trainer, sample_young
 
 # The full model for an online estimate: single frames, solved in another process.
@@ -111,7 +106,7 @@ class ExactSolver:
             (self._operator @ slopes.displacement.reshape(-1, count)).reshape(-1, 3, count),
             slopes.reaction_force)
 
-    def basis(self, poses: np.ndarray, log_young: np.ndarray) -> ReducedModel:
+    def basis(self, poses: np.ndarray, log_young: np.ndarray) -> reduced_model.ReducedModel:
         """Make a reduced model from full solutions at recorded poses, around ``log_young``."""
         young = np.exp(log_young)
         model = self._model.with_young(self.branch.weights @ young)
@@ -121,7 +116,7 @@ class ExactSolver:
         sampled = sample_young(young, len(held), np.random.default_rng(0), REFRESH_SPREAD)
         snapshots = trainer.take(held, sampled)
         return reduce_snapshots(model, self.grasp, self.branch.weights, young, snapshots,
-                                ReducedSettings())
+                                reduced_model.ReducedSettings())
 
 
 class Beside:
@@ -134,7 +129,7 @@ class Beside:
     def frame(self, *arguments: np.ndarray) -> "Future[ExactFrame | None]":
         return self._pool.submit(_asked, "frame", *arguments)
 
-    def basis(self, *arguments: np.ndarray) -> "Future[ReducedModel]":
+    def basis(self, *arguments: np.ndarray) -> "Future[reduced_model.ReducedModel]":
         return self._pool.submit(_asked, "basis", *arguments)
 
     def close(self) -> None:
@@ -178,7 +173,7 @@ class Kept:
     its squared residuals, and their RMS. ``state`` is None if it belongs to another basis."""
 
     frame: OnlineFrame
-    state: ReducedState | None
+    state: reduced_model.ReducedState | None
     centre: np.ndarray
     normal: np.ndarray
     gradient: np.ndarray
@@ -326,7 +321,7 @@ ENOUGH_DEVIATION = 0.02
 """Standard deviation of every log E below which another pull is not worthwhile: half a percent of
 the radius has the same effect.
 """
-QUICK = ReducedStaticSettings(start_count=2, max_halvings=2)
+QUICK = reduced_model.ReducedStaticSettings(start_count=2, max_halvings=2)
 """A pose that takes more is outside the basis' range, and another basis is being made."""
 FRAME_ITERATIONS, NEAR_ITERATIONS = 12, 6
 """Newton iterations while frames arrive: most for a frame; fewest for a frame with a known state,
@@ -372,7 +367,7 @@ class OnlineEstimator:
         exact: The full model; None: the reduced model is not corrected.
     """
 
-    def __init__(self, reduced: ReducedModel, entry: GraspEntry, mesh: TetMesh,
+    def __init__(self, reduced: reduced_model.ReducedModel, entry: GraspEntry, mesh: TetMesh,
                  rest_points: np.ndarray, *, position_sigma: float, force_sigma: float,
                  prior_deviation: float = 2.0, kept_count: int = 64,
                  exact: Beside | None = None):
@@ -385,7 +380,7 @@ class OnlineEstimator:
         self._information = Information(self.log_young, prior_deviation, kept_count)
         self._widths: list[np.ndarray] = []
         self._turn = self.frame_count = self.refresh_count = 0
-        self._last: ReducedState | None = None
+        self._last: reduced_model.ReducedState | None = None
         # Loading compiled code at the first call must not delay the first frame.
         reduced.sensitivities(reduced.solve_static(reduced.poses[0], settings=QUICK))
         self._exact = exact
@@ -396,7 +391,7 @@ class OnlineEstimator:
         self._retry: list[OnlineFrame] = []
         self._untrusted = self._since_basis = 0
 
-    def _use(self, reduced: ReducedModel) -> None:
+    def _use(self, reduced: reduced_model.ReducedModel) -> None:
         self.reduced = reduced
         columns = reduced.basis.columns.reshape(reduced.size, -1)
         self._observe = np.asarray(point_operator(self._mesh, self.rest_points) @ columns.T)
@@ -473,7 +468,7 @@ class OnlineEstimator:
         return self._state(last.frame.time, last.residual,
                            present(last.state, "state of the last frame").trusted)
 
-    def _try_again(self, settings: ReducedStaticSettings) -> None:
+    def _try_again(self, settings: reduced_model.ReducedStaticSettings) -> None:
         """Process a frame that the previous basis did not cover."""
         frame = self._retry.pop(0)
         found = self._linearised(frame, None, settings)
@@ -570,9 +565,9 @@ class OnlineEstimator:
         chosen = np.unique(np.linspace(0, len(frames) - 1, 24).round().astype(int))
         return np.array([frames[index].pose for index in chosen])
 
-    def _answer(self, frame: OnlineFrame, start: ReducedState | None, log_young: np.ndarray,
-                settings: ReducedStaticSettings,
-                ) -> tuple[ReducedState, np.ndarray, np.ndarray] | None:
+    def _answer(self, frame: OnlineFrame, start: reduced_model.ReducedState | None,
+                log_young: np.ndarray, settings: reduced_model.ReducedStaticSettings,
+                ) -> tuple[reduced_model.ReducedState, np.ndarray, np.ndarray] | None:
         """The reduced model's state, rows of points and force, and their derivatives."""
         model = self.reduced.with_young(np.exp(log_young))
         state = model.solve_static(pose_on(self.reduced.grasp, self._entry, frame.pose),
@@ -583,8 +578,8 @@ class OnlineEstimator:
         return (state, np.r_[self._observe @ state.coordinates, state.reaction_force],
                 np.vstack([self._observe @ slopes.coordinates, slopes.reaction_force]))
 
-    def _linearised(self, frame: OnlineFrame, start: ReducedState | None,
-                    settings: ReducedStaticSettings) -> Kept | None:
+    def _linearised(self, frame: OnlineFrame, start: reduced_model.ReducedState | None,
+                    settings: reduced_model.ReducedStaticSettings) -> Kept | None:
         found = self._answer(frame, start, self.log_young, settings)
         if found is None:
             return None
@@ -601,7 +596,7 @@ class OnlineEstimator:
         return Kept(frame, state, self.log_young.copy(), scaled @ jacobian, scaled @ off,
                     float(np.sqrt(np.mean(off**2))) if len(off) else 0.0)
 
-    def _relinearise(self, settings: ReducedStaticSettings) -> None:
+    def _relinearise(self, settings: reduced_model.ReducedStaticSettings) -> None:
         self._turn = (self._turn + 1) % (len(self._information.kept) - 1)
         old = self._information.kept[self._turn]
         again = self._linearised(old.frame, old.state, settings)
@@ -634,5 +629,5 @@ class OnlineEstimator:
                     and widths[-1].max() < IDLE_DEVIATION)
 
 
-def _within(iterations: int) -> ReducedStaticSettings:
+def _within(iterations: int) -> reduced_model.ReducedStaticSettings:
     return replace(QUICK, iteration_limit=iterations)

@@ -16,13 +16,7 @@ from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import under_its_weight
-from limber.estimation.online.filter import (
-    Beside,
-    FullBranch,
-    OnlineEstimator,
-    OnlineFrame,
-    OnlineState,
-)
+from limber.estimation.online import filter as filtering
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.model_error import ModelError, geometry_error, total_interval
@@ -65,11 +59,11 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Fit
     if _size(where()) != size:
         # It is being recorded now: missed frames are caught up.
         pace = np.inf
-    states: list[OnlineState] = []
+    states: list[filtering.OnlineState] = []
     reported = begun_sentences(first, progress)
     is_exact = "enough" not in reported
     slowest, stopped = 0.0, False
-    with Beside(begun.branch) as beside:
+    with filtering.Beside(begun.branch) as beside:
         estimator = begun.estimator(beside)
         try:
             for frame, share in paced(where, pace):
@@ -113,7 +107,7 @@ def begun_sentences(pull: Pull, progress: Progress) -> set[str]:
     return {"enough"}
 
 
-def _report(name: str, state: OnlineState, share: float, reported: set[str],
+def _report(name: str, state: filtering.OnlineState, share: float, reported: set[str],
             progress: Progress) -> None:
     """Report how well a pull is known; ``reported`` are the sentences already reported."""
     progress(0.5 + 0.45 * share, "following", time_s=state.time,
@@ -126,7 +120,7 @@ def _report(name: str, state: OnlineState, share: float, reported: set[str],
             reported.add(kind)
 
 
-def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[str, Any]:
+def _with_radii(axes: Path | None, subject: Subject, last: filtering.OnlineState) -> dict[str, Any]:
     """The last interval combined with the uncertainty of the scan's radii, as in an estimate."""
     if axes is None:
         return {}
@@ -141,17 +135,17 @@ class Begun:
     far, and the prior deviation of log E."""
 
     reduced: ReducedModel
-    branch: FullBranch
+    branch: filtering.FullBranch
     pull: Pull
     prior_deviation: float
 
-    def estimator(self, exact: Beside | None) -> OnlineEstimator:
+    def estimator(self, exact: filtering.Beside | None) -> filtering.OnlineEstimator:
         """Return the estimator that processes the frames."""
         # A full collection would visit all objects of all imported libraries during a frame.
         gc.collect()
         gc.freeze()
         sensor = self.pull.entry.sensor
-        return OnlineEstimator(
+        return filtering.OnlineEstimator(
             self.reduced, self.pull.entry.grasp, self.branch.mesh, self.branch.rest_points,
             position_sigma=sensor.position_sigma_m, force_sigma=sensor.force_sigma_n,
             prior_deviation=self.prior_deviation, exact=exact)
@@ -183,9 +177,9 @@ def begin(pull: Pull, subject: Subject, settings: FitSpec, progress: Progress,
                                ReducedSettings(training=training), progress)
     rest = subject.control_points if pull.entry.rest_points_m is None else np.array(
         pull.entry.rest_points_m)
-    branch = FullBranch(subject.mesh, subject.weights, pull.entry.grasp, rest, start.poisson,
-                        start.density, tuple(model.gravity), model.point_masses,
-                        model.prestress is not None)
+    branch = filtering.FullBranch(
+        subject.mesh, subject.weights, pull.entry.grasp, rest, start.poisson, start.density,
+        tuple(model.gravity), model.point_masses, model.prestress is not None)
     return Begun(reduced, branch, pull, deviation)
 
 
@@ -212,10 +206,10 @@ def _size(folder: Path) -> int:
         return -1
 
 
-def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[OnlineFrame, float]]:
+def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[filtering.OnlineFrame, float]]:
     """Yield the frames of a pull as they arrive, each with the processed fraction."""
     sent, start, last_growth, size = -np.inf, None, time.monotonic(), None
-    frames: list[OnlineFrame] = []
+    frames: list[filtering.OnlineFrame] = []
     while True:
         folder = where()
         now = folder, _size(folder)
@@ -242,17 +236,17 @@ def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[OnlineFrame,
             time.sleep(0.02)
 
 
-def online_frames(pull: Pull) -> Iterator[OnlineFrame]:
+def online_frames(pull: Pull) -> Iterator[filtering.OnlineFrame]:
     """Return the aligned frames of the recording so far."""
     seen = pull.observations
     frames = frames_of(pull if seen is None else replace(
         pull, observations=Observations(seen.times, seen.positions)))
     for index in range(len(frames)):
-        yield OnlineFrame(float(frames.times[index]), frames.poses[index],
+        yield filtering.OnlineFrame(float(frames.times[index]), frames.poses[index],
                           frames.wrenches[index, :3], frames.positions[index])
 
 
-def _result(name: str, states: list[OnlineState], slowest: float) -> dict[str, Any]:
+def _result(name: str, states: list[filtering.OnlineState], slowest: float) -> dict[str, Any]:
     last = states[-1]
     return {"method": "online", "pull": name, "young_pa": last.young,
             "young_interval_pa": last.interval, "frame_count": len(states),
@@ -260,7 +254,7 @@ def _result(name: str, states: list[OnlineState], slowest: float) -> dict[str, A
             "untrusted_frames": sum(not state.trusted for state in states)}
 
 
-def _history(states: list[OnlineState]) -> list[dict[str, Any]]:
+def _history(states: list[filtering.OnlineState]) -> list[dict[str, Any]]:
     return [{"time_s": state.time, "young_pa": state.young,
                          "young_interval_pa": state.interval, "residual": state.residual,
                          "enough": state.enough, "idle": state.idle} for state in states]

@@ -7,9 +7,9 @@ import scipy
 from typing_extensions import TypedDict
 
 from limber.core.progress import SILENT, Progress
+from limber.estimation.fitting import optimise
 from limber.estimation.fitting.nuisances import OTHER_CAUSES, advice_on
-from limber.estimation.fitting.objective import Evaluation, Objective, inverse_information
-from limber.estimation.fitting.optimise import OUTLYING, WANDERING_STEP, Fit, gauss_newton
+from limber.estimation.fitting.objective import Evaluation, Objective, Work, inverse_information
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, YoungField
 from limber.estimation.uncertainty.drift import scale_steps
 from limber.recordings.recording import calibration_of
@@ -37,9 +37,10 @@ class Uncertainty:
     quantile: float = 1.96
 
 
-def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
-    """Return Gauss' approximation at a fit's end, without the mesh's error (:mod:`.model_error`).
-    """
+def uncertainty(evaluation: Evaluation, objective: Objective, left: np.ndarray | None = None,
+                ) -> Uncertainty:
+    """Return Gauss' approximation at a fit's end, without the mesh's error (:mod:`.model_error`);
+    the step ``left`` [p] of a fit that did not end counts as an error of one deviation."""
     factor, repetition, freedom = noise_of(evaluation, objective)
     covariance = inverse_information(scaled_rows(evaluation.slopes, objective.space.own_row_count,
                                                  factor * repetition))
@@ -47,8 +48,9 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     together = np.zeros(len(covariance))
     together[:objective.space.group_count] = 1.0
     covariance += np.outer(together, together) * from_recording**2 / len(objective.forwards)
+    covariance += 0.0 if left is None else np.outer(left, left)
     deviation = np.sqrt(np.diag(covariance))
-    quantile = float(scipy.special.stdtrit(freedom, 0.5 + level / 2))
+    quantile = float(scipy.special.stdtrit(freedom, 0.975))
     width = quantile * deviation
     space = objective.space
     # Wider than 30 orders of magnitude means unknown.
@@ -83,13 +85,13 @@ def noise_of(evaluation: Evaluation, objective: Objective) -> tuple[float, float
     return factor, repeated(objective.standardised(evaluation)), freedom
 
 
-def weighed(fit: Fit, objective: Objective) -> Fit:
+def weighed(fit: optimise.Fit, objective: Objective) -> optimise.Fit:
     """Fit again with measurements and priors by the noise that the residuals show. A misfit that is
     alike in all frames would else draw unknowns far beyond their priors: four frames of a hung
     weight, Poisson's ratio."""
     factor, repetition, _ = noise_of(fit.evaluation, objective)
     objective.variance = factor * repetition
-    return gauss_newton(objective, fit.evaluation.free, is_near=True, shortest=WANDERING_STEP)
+    return optimise.gauss_newton(objective, fit.evaluation.free, is_near=True)
 
 
 def scaled_rows(rows: np.ndarray, own_row_count: int, scale: float) -> np.ndarray:
@@ -191,19 +193,18 @@ LONGEST_STEP = 0.5
 """In standard deviations; beyond it the approximation is invalid, and the fit is kept."""
 
 
-def averaged(fit: Fit, objective: Objective) -> Fit:
-    """Return the fit moved to the mode of the moduli's marginal density; unchanged if the form of
-    the field is not an unknown."""
-    field = objective.forwards[0].field
-    if not field.names or not set(field.names) <= set(objective.space.extra):
-        return fit
-    slopes = scaled_rows(fit.evaluation.slopes, objective.space.own_row_count, objective.variance)
-    step = marginal_step(fit.evaluation.free, slopes, objective.space, field)
-    if not np.linalg.norm(slopes @ step) < LONGEST_STEP:
-        return fit
-    lower, upper = objective.space.bounds()
-    found = objective.evaluate(np.clip(fit.evaluation.free + step, lower, upper), jacobian=True)
-    return fit if found is None else Fit(found, fit.status, fit.reason)
+def averaged(fit: optimise.Fit, objective: Objective) -> optimise.Fit:
+    """Return the fit moved by the short step that was left, and to the mode of the moduli's
+    marginal density if the form of the field is an unknown."""
+    field, free = objective.forwards[0].field, fit.evaluation.free
+    step = np.zeros(len(free)) if fit.left is None else fit.left
+    if field.names and set(field.names) <= set(objective.space.extra):
+        slopes = scaled_rows(fit.evaluation.slopes, objective.space.own_row_count,
+                             objective.variance)
+        to_mode = marginal_step(free, slopes, objective.space, field)
+        step = step + to_mode * bool(np.linalg.norm(slopes @ to_mode) < LONGEST_STEP)
+    found = objective.moved(fit.evaluation, step)
+    return fit if found is None else optimise.Fit(found, fit.status, fit.reason)
 
 
 def marginal_step(free: np.ndarray, slopes: np.ndarray, space: ParameterSpace,
@@ -324,12 +325,15 @@ TRIES = 4
 """Most simulations for one limit; observed were 1 to 4."""
 NEAR = 0.1
 """Change of log E below which a limit has converged."""
+LIMITS_SHARE = 0.25
+"""Part of a fit's budget for the limits of wide intervals."""
 
 
 def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
-             progress: Progress = SILENT) -> Uncertainty:
+             progress: Progress = SILENT) -> tuple[Uncertainty, Evaluation | None, Objective]:
     """Return the uncertainty with wide intervals by the profile likelihood. The covariance stays:
-    it holds for what depends on the moduli as measurements do, linear in the compliance."""
+    it holds for what depends on the moduli as measurements do, linear in the compliance. Beside it
+    a place that leads to a lower loss, if one was met: there is no end of the fit then."""
     space = objective.space
     found = _Profile(sure, evaluation, objective, progress)
     interval = sure.young_interval.copy()
@@ -343,8 +347,12 @@ def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
         sides = [-np.hypot(low, common), np.hypot(high, common)]
         members = np.array(space.groups) == group
         interval[members] = np.exp(evaluation.free[group] + sides)
+    if found.work.left <= 0:
+        progress.warn("The budget was spent before the limits of all wide intervals were found: "
+                      "those end at the largest plausible ratio to the neighbour's modulus.")
     lower, upper = (np.exp(each[0]) for each in space.bounds())
-    return replace(sure, young_interval=np.clip(interval, lower, upper))
+    return (replace(sure, young_interval=np.clip(interval, lower, upper)), found.lower,
+            found.objective)
 
 
 class _Profile:
@@ -353,14 +361,18 @@ class _Profile:
     def __init__(self, sure: Uncertainty, evaluation: Evaluation, objective: Objective,
                  progress: Progress):
         self._best, self._objective, self._quantile = evaluation, objective, sure.quantile
-        self._progress = progress
+        self._progress, self.work = progress, Work(LIMITS_SHARE)
         self._scale = sure.variance_factor * sure.repetition
+        self.lower: Evaluation | None = None
+        # A fit is beside the end of its descent, at the mode.
+        self.objective, self._cost = objective, optimise.cost_of(
+            evaluation, objective) - (optimise.UNSETTLED_FALL + LONGEST_STEP**2 / 2) * self._scale
         self._slopes = self._scaled(evaluation.slopes)
         self._covariance = inverse_information(self._slopes)
         self.deviations = np.sqrt(np.diag(self._covariance))
         # As in the fit, an outlier has no more weight than a residual just beyond the others.
         residual = evaluation.residual
-        self._pull = self._scaled(residual / np.sqrt(1 + (residual / OUTLYING)**2))
+        self._pull = self._scaled(residual / np.sqrt(1 + (residual / optimise.OUTLYING)**2))
         # Priors and links are linear: they have no curvature to account for.
         self._pull[len(residual) - objective.space.own_row_count:] = 0.0
 
@@ -370,7 +382,7 @@ class _Profile:
         # equilibrium.
         high, bend = self._limit(group, 1.0, self._quantile)
         low, _ = self._limit(group, -1.0, max(limit_of(bend, -self._quantile), -self._quantile))
-        if high > self._quantile and high == self._farthest(group, 1.0):
+        if self.work.left > 0 and high > self._quantile and high == self._farthest(group, 1.0):
             self._progress.warn(
                 f"These pulls give no upper limit of {self._objective.space.names[group]}: a "
                 "stiffer piece would hardly change the measurements. Its interval ends at the "
@@ -383,9 +395,12 @@ class _Profile:
     def _limit(self, group: int, side: float, first: float) -> tuple[float, float]:
         """Limit to one side, in deviations, and the curvature of the profile up to there."""
         objective, target = self._objective.on_copies(), side * self._quantile
+        objective.work = self.work
         farthest, bend = self._farthest(group, side), 0.0
         at, others = side * min(abs(first), abs(farthest)), np.zeros(len(self._best.free))
         for _ in range(TRIES):
+            if self.work.left <= 0:
+                return self._farthest(group, side), bend
             self._progress(1.0, "finding the limits of wide intervals")
             found = self._rise(objective, group, at, others)
             if found is None:
@@ -428,6 +443,8 @@ class _Profile:
         step[movable] = -np.linalg.lstsq(slopes[:, movable].T @ slopes[:, movable],
                                          gradient[movable], rcond=None)[0]
         rise = change @ change + 2 * self._pull @ bent - np.sum((slopes @ step)**2)
+        if (cost := optimise.cost_of(found, objective)) < self._cost:
+            self.lower, self.objective, self._cost = found, objective, cost
         return float(rise), free - best.free - direction + step
 
     def _scaled(self, rows: np.ndarray) -> np.ndarray:

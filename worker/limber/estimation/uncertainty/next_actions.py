@@ -20,12 +20,7 @@ from limber.estimation.fitting.nuisances import REGISTER, Action
 from limber.estimation.fitting.objective import Evaluation, Objective, inverse_information
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
-from limber.estimation.uncertainty.covariance import (
-    InformationRows,
-    Uncertainty,
-    information_rows,
-    scaled_rows,
-)
+from limber.estimation.uncertainty import covariance as known
 from limber.estimation.uncertainty.model_error import ModelError, path_slopes, total_interval
 
 WORTHWHILE = 0.98
@@ -56,12 +51,12 @@ class Prospects:
     """Intervals to expect after actions, from the end of the fit with derivatives, its errors of
     shape and mesh, and the moduli on the mesh [K] [Pa]."""
 
-    def __init__(self, evaluation: Evaluation, objective: Objective, sure: Uncertainty,
+    def __init__(self, evaluation: Evaluation, objective: Objective, sure: known.Uncertainty,
                  error: ModelError, young: np.ndarray):
         self._objective, self._error, self._spread = objective, error, sure.recording_spread
         self._evaluation = evaluation
         self._scale = sure.variance_factor * sure.repetition
-        self._rows = information_rows(evaluation, objective, self._scale)
+        self._rows = known.information_rows(evaluation, objective, self._scale)
         self._pull_count = len(objective.forwards)
         self._middle = np.log(young * error.mesh_factor)
         self._interval = np.log(total_interval(young, sure.young_interval, error))
@@ -103,7 +98,7 @@ class Prospects:
         return {"action": action, "how": how, "young_interval_pa": interval.tolist(),
                 "width_share": float(share.mean())}
 
-    def _deviation(self, rows: Sequence[InformationRows], pull_count: int | None = None,
+    def _deviation(self, rows: Sequence[known.InformationRows], pull_count: int | None = None,
                    error: ModelError | None = None) -> np.ndarray:
         """Standard deviation of log E at the control points, shape [K]."""
         covariance = inverse_information(np.vstack([each.rows for each in rows]))
@@ -128,12 +123,12 @@ class Prospects:
                 found[_WEIGH] = {name: max(sigma / _WEIGHED, 1.0)}
         return found
 
-    def _measured(self, action: Action) -> list[InformationRows]:
+    def _measured(self, action: Action) -> list[known.InformationRows]:
         """The rows with narrower priors; anything else as it is."""
         factors = self._factors().get(action, {})
         return [replace(each, rows=factors.get(each.name, 1.0) * each.rows) for each in self._rows]
 
-    def _seen_twice(self) -> list[InformationRows]:
+    def _seen_twice(self) -> list[known.InformationRows]:
         """Two cameras with independent errors see the mean of both as one with smaller errors."""
         causes = ("noise of the points", "camera frame", "places of the points")
         return [replace(each, rows=2**0.5 * each.rows) if each.cause in causes else each
@@ -160,14 +155,15 @@ class Prospects:
         if found is None or slopes is None:
             return None
         # With the torque, the gripper's frame is an unknown of the fit.
-        by_free, by_frame = (scaled_rows(each, self._objective.space.own_row_count, self._scale)
+        own = self._objective.space.own_row_count
+        by_free, by_frame = (known.scaled_rows(each, own, self._scale)
                              for each in (found.slopes, slopes[1]))
         size = by_frame.shape[1]
         rows = np.block([[by_free, by_frame], [np.zeros((size, by_free.shape[1])), np.eye(size)]])
-        return self._deviation([InformationRows("", rows)],
+        return self._deviation([known.InformationRows("", rows)],
                                error=self._error.having(path=None))
 
-    def _with_repetition(self, number: int) -> list[InformationRows]:
+    def _with_repetition(self, number: int) -> list[known.InformationRows]:
         """Measurements of a pull once more, with its own errors and its own course of the force."""
         own = self._own_columns(number)
         width = self._rows[0].rows.shape[1]

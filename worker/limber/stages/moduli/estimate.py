@@ -159,7 +159,9 @@ class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
         Writes ``estimate.json`` and the modulus into ``mesh.vtu``. If stopped by Ctrl-C it keeps
         the best result so far in ``estimate.json`` (``converged`` is then false). With ``resume``
         it starts from there, and ends at the same moduli to the fit's tolerance, not to the last
-        digit; without it nothing from a stopped or killed run is used.
+        digit; without it nothing from a stopped or killed run is used. A fit that has spent its
+        budget of work leaves the same, with a warning that says how far it was from its end; the
+        next run goes on from there.
 
         Returns:
             DESIGN's keys and ``warnings``.
@@ -200,33 +202,27 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
     from limber.estimation.fitting.objective import EvaluationLog
     from limber.recordings.slips import slips_of
     from limber.stages.moduli.other_skeletons import add_other_skeletons
-    from limber.store.loading import (
-        fit_spec,
-        load_pulls,
-        load_subject,
-        pull_names,
-        pulls_digest,
-        wood_digest,
-    )
+    from limber.store import loading
 
-    names = pull_names(branch, asked)
-    settings = fit_spec(branch, asked)
-    subject = load_subject(branch, settings)
+    names = loading.pull_names(branch, asked)
+    settings = loading.fit_spec(branch, asked)
+    subject = loading.load_subject(branch, settings)
     digests = {"mesh geometry": subject.mesh.geometry_digest(),
-               "pulls": pulls_digest(branch, names)} | wood_digest(branch)
-    if asked.is_kept(branch, digests=digests) and not (
-            stored := branch.manifest.stages["estimate"].result).get("stopped"):
+               "pulls": loading.pulls_digest(branch, names)} | loading.wood_digest(branch)
+    if asked.is_kept(branch, digests=digests) and (
+            stored := branch.manifest.stages["estimate"].result)["converged"]:
         return stored
     warnings: list[str] = []
     heard = progress.keeping(warnings)
-    pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
+    pulls = loading.load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
     tell_doubts(pulls, subject, heard)
     for each in [slip for pull in pulls for slip in slips_of(pull, subject.skeleton)]:
         heard.warn(each)
     log_path = branch.folder / EVALUATIONS
-    if asked.force or not asked.resume:
+    if asked.force:
         log_path.unlink(missing_ok=True)
-    log = EvaluationLog(log_path, json.dumps([plain(asked), digests], sort_keys=True))
+    log = EvaluationLog(log_path, json.dumps([plain(asked), digests], sort_keys=True),
+                        resumes=asked.resume)
     initial, evidence = subject, None
     if is_open(settings):
         pulls = _placed(pulls, initial)
@@ -235,10 +231,9 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
         found, settings, subject, evidence = _with_supported_points(
             branch, pulls, subject, settings, log, heard.part(0.2, 0.9))
     else:
-        found = fit_branch(pulls, subject, settings, log=log,
-                           progress=heard.part(0.2, 0.9))
+        found = fit_branch(pulls, subject, settings, log=log, progress=heard.part(0.2, 0.9))
     found.warnings = warnings
-    if not found.stopped:
+    if not found.fit.is_unfinished:
         require_result(found, subject.skeleton)
         judge_model(found, subject, pulls[0].entry.grasp, settings,
                     axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None,
@@ -247,18 +242,22 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
                             heard.part(0.95, 0.98))
         if settings.hold_out:
             _score_unused_pulls(branch, names, subject, found, settings, initial, heard)
+    elif not found.stopped:
+        heard.warn("The fit has not ended: these moduli are no result, and are not in the mesh. "
+                   f"{found.fit.reason} Run the estimate again: it goes on from there.")
     result = summary(found, settings) | ({} if evidence is None else {
         "control_point_evidence": evidence, "fractions": settings.initial_fractions})
     earlier = branch.manifest.stages.get("estimate")
-    if found.stopped and earlier is not None and not earlier.result.get("stopped"):
-        raise Cancelled("The estimate was stopped.",
-                        "The finished estimate of an earlier run is kept.",
-                        "Run it again when there is time for it.")
+    if found.fit.is_unfinished and earlier is not None and earlier.result["converged"]:
+        raise (Cancelled if found.stopped else WorkError)(
+            f"The fit has not ended. {found.fit.reason}",
+            "The finished estimate of an earlier run is kept.",
+            "Run it again when there is time for it.")
     with branch.stage("estimate", asked, digests=digests) as stage:
-        full = result | details(found, subject, pulls)
-        stage.write("estimate.json", full)
-        if not found.stopped:
-            whole = load_subject(branch, settings)
+        stage.write("estimate.json", result | details(found, subject, pulls))
+        if not found.fit.is_unfinished:
+            log.forget()
+            whole = loading.load_subject(branch, settings)
             whole.mesh.with_data(cell_data={
                 "young": whole.young(found.values),
                 "poisson": np.full(whole.mesh.tet_count, found.values.poisson),
@@ -270,7 +269,6 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
                         f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
                         "estimate.json, not in the mesh.",
                         "Run it again with ", Option("resume", True), " to start from there.")
-    log.forget()
     return stage.result
 
 
@@ -282,14 +280,14 @@ def _with_supported_points(
     fit, its settings and branch, and the log evidence by number of control points."""
     from limber.estimation.estimated_branch import lumped
     from limber.estimation.fit import complete, fit_branch, supported
-    from limber.estimation.fitting.objective import EvaluationLog
+    from limber.estimation.fitting.objective import EvaluationLog, Work
     from limber.store.loading import load_subject
 
     told: list[str] = []
-    first = fit_branch(pulls, subject, settings, log=log, quick=True,
+    first = fit_branch(pulls, subject, settings, log=log, quick=True, work=(work := Work()),
                        progress=progress.part(0.0, 0.7).keeping(told, silently=True))
     found, chosen, model, evidence = first, settings, subject, None
-    if not first.stopped and first.is_bad is None:
+    if first.is_bad is None:
         support = supported(first)
         evidence = support.evidence
         if support.fractions != settings.initial_fractions:
@@ -297,12 +295,16 @@ def _with_supported_points(
             model = lumped(load_subject(branch, chosen), pulls, chosen)
             heard: list[str] = []
             try:
-                found = fit_branch(pulls, model, chosen, log=EvaluationLog(None, ""), quick=True,
-                                   near=support.start, known=first.objective.forwards,
-                                   progress=progress.part(0.7, 0.9).keeping(heard, silently=True))
-                told = heard
+                second = fit_branch(
+                    pulls, model, chosen, log=EvaluationLog(None, ""), quick=True, work=work,
+                    near=support.start, known=first.objective.forwards,
+                    progress=progress.part(0.7, 0.9).keeping(heard, silently=True))
+                if second.stopped or not second.fit.is_unfinished:
+                    found, told = second, heard
             except WorkError:
                 # Of the two the first has an equilibrium.
+                pass
+            if found is first:
                 chosen, model = settings, subject
     for message in told:
         progress.warn(message)
