@@ -55,7 +55,7 @@ def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[st
 
 def command_to_type(template: str, values: Mapping[str, Any]) -> str:
     """Return a command with names and paths filled in, quoted for a shell; "" if one is missing.
-    ``{name:if}`` requires a value but prints nothing."""
+    ``{name:if}`` requires a value but prints nothing; ``{name:a/b}`` is a if it is true, else b."""
     try:
         return _QUOTED.vformat(template, (), values)
     except _NotThere:
@@ -118,6 +118,8 @@ class _Quoted(_Filled):
     """Fills names and paths into a command."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
+        if "/" in format_spec:
+            return format_spec.split("/")[not value]
         return "" if format_spec == "if" else shlex.quote(str(value))
 
 

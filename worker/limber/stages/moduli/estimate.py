@@ -142,7 +142,8 @@ class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
         found=(_moduli_line, "Main cause of the uncertainty: {causes[0][cause]} "
                "({causes[0][share]:share} of the variance). Remedy: {causes[0][advice]}.",
                "Next: {next_actions[0][action]}, {next_actions[0][how]}."),
-        then="limber energy {branch_folder}", step="estimate", label="Estimate")
+        then="limber {converged:energy/estimate} {branch_folder}", step="estimate",
+        label="Estimate")
 
     bag: Path | None = option(
         "Import this recording first (MCAP, rosbag2, RTDE log) as a pull with the file's name, and "
