@@ -12,6 +12,7 @@ from limber.geometry.skeleton.alternatives import (
     attachments,
     open_questions,
 )
+from limber.geometry.skeleton.confidence import PLACED
 from limber.geometry.skeleton.edits import edited
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 from limber.geometry.skeleton.totals import total_length
@@ -28,7 +29,7 @@ def _tree(*chances: float) -> Skeleton:
              _chain([0.15, 0, 0.4], [0.15, 0.1, 0.4], 4), _chain([0, 0, 0.7], [-0.2, 0, 0.7], 4)]
     parent = [np.arange(-1, 20), [8, *range(21, 26)], [23, *range(27, 30)], [14, *range(31, 34)]]
     one, upper, other = chances
-    chance = np.repeat([1.0, one, one * upper, other], [21, 6, 4, 4])
+    chance = np.repeat([1.0, PLACED * one, PLACED**2 * one * upper, PLACED * other], [21, 6, 4, 4])
     return Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.full(35, 0.01),
                                probability=chance)
 
@@ -80,7 +81,7 @@ def test_a_bridged_piece_may_be_attached_at_its_rival() -> None:
 
 def test_confirming_a_branch_settles_its_attachment() -> None:
     assert attachments(_tree(1.0, 1.0, 0.9), [_bridge(0.55)])
-    assert not attachments(_tree(1.0, 1.0, 1.0), [_bridge(0.55)])
+    assert not attachments(replace(_tree(1, 1, 1), probability=np.ones(35)), [_bridge(0.55)])
 
 
 def test_the_length_counts_the_other_attachment() -> None:
@@ -97,7 +98,8 @@ def test_a_dropped_twig_can_be_added_and_the_root_changed() -> None:
     tree = _tree(1.0, 1.0, 1.0)
     twig = {"length": 0.2, "from": np.array([0, 0, 0.2]), "at": np.array([0, 0.2, 0.2]),
             "radius": 0.004, "probability": 0.4}
-    doubts = SearchDoubts(unlikely=[twig], other_root=np.array([0, 0, 1.0]), root_probability=0.6)
+    doubts = SearchDoubts(unlikely=[twig], root_ends=[
+        {"at": np.zeros(3), "probability": 0.6}, {"at": np.array([0, 0, 1.0]), "probability": 0.4}])
     used, *others = alternatives(tree, doubts)
     assert used.probability == pytest.approx(0.36)
     assert [sorted(edit.do for edit in graph.edits) for graph in others][2] == ["add", "root"]

@@ -48,17 +48,11 @@ def test_limits_that_exclude_each_other_are_refused():
         checked_settings(ReconstructSettings, {"radius_range": (0.2, 0.1)})
 
 
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory):
-    path = tmp_path_factory.mktemp("scan") / "cloud.ply"
-    generate_branch(2, length=0.3, fork_count=1, point_spacing=0.004).cloud.write_ply(path)
-    return path
-
-
 @pytest.mark.slow
-def test_reconstruct_takes_them(scan, capsys):
+def test_reconstruct_takes_them(tmp_path, capsys):
     """Mesh, skeleton and record have the radii of the aligned cloud's nearest points."""
-    folder = scan.parent / "a.branch"
+    folder, scan = tmp_path / "a.branch", tmp_path / "cloud.ply"
+    generate_branch(2, length=0.3, fork_count=1, point_spacing=0.004).cloud.write_ply(scan)
     assert call(["reconstruct", str(scan), "-o", str(folder), "--radii", "paper",
                  "--radius-neighbours", "30", "--json"]) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -73,8 +67,8 @@ def test_reconstruct_takes_them(scan, capsys):
 
 
 @pytest.mark.slow
-def test_gamma_and_the_weights_of_contraction_change_the_skeleton(scan):
-    points = read_points(scan).points
+def test_gamma_and_the_weights_of_contraction_change_the_skeleton():
+    points = generate_branch(2, length=0.3, fork_count=1, point_spacing=0.002).cloud.points
     near = contract(points, weight=0.05).history[0]["moved"]
     assert contract(points).history[0]["moved"] > 2 * near
     bridges = [len(skeletonise(points, SkeletonSettings(gap_factor=gamma)).bridges)

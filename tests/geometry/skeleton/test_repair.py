@@ -47,13 +47,13 @@ def _before(skeleton: Skeleton, points: np.ndarray | None = None, noise=NOISE) -
     points = _shell() if points is None else points
     seen = seen_sides(*[np.empty((0, 3))] * 2, *[np.ones(1)] * 3, np.zeros(1))
     fit = AxisFit(skeleton, np.zeros(len(points), int), np.zeros(len(points)), noise, seen)
-    return Repaired(skeleton, points, (1e-4, 0.05), fit=fit)
+    return Repaired(skeleton, points, fit=fit)
 
 
 def _apart() -> Repaired:
     tree, points = stations.merged(stations.SHIFTS, stations.EYES)
     fit = fit_axes(tree, points)
-    return Repaired(fit.skeleton, points, (1e-4, 0.05), fit=fit)
+    return Repaired(fit.skeleton, points, fit=fit)
 
 
 def _hair(part: slice, thin: float = 4e-4) -> Skeleton:
@@ -99,8 +99,6 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
                                             _twig(0.14, reach=0.018)]), at=39)),
             lambda now: abs(now.skeleton.nodes[now.skeleton.forks()[0], 2] - 0.14) < 0.011),
         "lengthen ends": lambda: (_before(_branch(ALONG[10:70])), _ends(0.0, 0.392)),
-        "limit radii": lambda: (_before(_branch(radius=0.3)),
-                                lambda now: bool((now.skeleton.radius == 0.05).all())),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), noise=0.003), _centred),
         "draw ends back": lambda: (_before(_branch(np.vstack([

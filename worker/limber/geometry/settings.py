@@ -72,8 +72,9 @@ class SkeletonSettings(Settings):
         24, ge=1, le=10_000, description="Number of nearest points for --radii paper: the paper's "
         "k.")
     radius_range: tuple[float, float] = Field(
-        (5e-4, 0.1), description="Smallest and largest radius, as fractions of the cloud's "
-        "diagonal D: the paper's alpha and beta.", json_schema_extra={"metavar": "LOW HIGH"})
+        (5e-4, 0.1), description="Smallest and largest radius for --radii paper, as fractions of "
+        "the cloud's diagonal D: the paper's alpha and beta.",
+        json_schema_extra={"metavar": "LOW HIGH"})
 
     @field_validator("radius_range")
     @classmethod
@@ -83,11 +84,6 @@ class SkeletonSettings(Settings):
             raise ValueError("the smallest radius must be above 0 and below the largest, which is "
                              "at most 1")
         return limits
-
-    def radius_limits(self, diagonal: float) -> tuple[float, float]:
-        """Return the smallest and the largest radius [m] in a cloud of this diagonal [m]."""
-        low, high = self.radius_range
-        return low * diagonal, high * diagonal
 
 
 class MeshSettings(Settings):

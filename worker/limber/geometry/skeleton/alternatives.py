@@ -44,17 +44,14 @@ class SearchDoubts:
 
     bridges: Sequence[dict[str, Any]] = ()
     unlikely: Sequence[dict[str, Any]] = ()
-    other_root: np.ndarray | None = None
-    root_probability: float = 1.0
+    root_ends: Sequence[dict[str, Any]] = ()
     length_spread: float | None = None
 
     @classmethod
     def of(cls, result: dict[str, Any]) -> "SearchDoubts":
         """The same from a stage's result; empty for a skeleton that was not searched."""
-        root = result.get("other_root")
         return cls(result.get("bridges") or (), result.get("unlikely_twigs") or (),
-                   None if root is None else np.array(root, float),
-                   result.get("root_probability", 1.0), result.get("length_spread"))
+                   result.get("root_ends") or (), result.get("length_spread"))
 
 
 @dataclass(frozen=True)
@@ -107,13 +104,14 @@ def alternatives(skeleton: Skeleton, doubts: SearchDoubts, count: int = 5) -> li
     probability. ``doubts`` is what its search left open, in the same frame."""
     decisions, root = _decisions(skeleton, doubts), _root_edit(skeleton, doubts)
     existing = probability_given_carrier(skeleton)
-    rooted = doubts.root_probability if root else 1.0
-    used = float(_logs([*existing, *(chance for _, chance, _ in decisions), rooted]).sum())
+    ends = [end["probability"] for end in doubts.root_ends[:2]] if root else [1.0, 0.0]
+    rooted, elsewhere = _logs(ends).tolist()
+    used = float(_logs([*existing, *(chance for _, chance, _ in decisions)]).sum()) + rooted
     found = [Alternative(float(np.exp(used)), skeleton.length, ())]
     ranked = _ranked(skeleton, existing, decisions, count + 1)
     if root:
         # Last: the other edits refer to the directions of this root.
-        ranked = _product(ranked, _either(rooted, root), count + 1)
+        ranked = _product(ranked, [(rooted, ()), (elsewhere, (root,))], count + 1)
     for log, edits in ranked:
         if edits and len(found) < count:
             length = _length_after(skeleton, edits)
@@ -154,9 +152,9 @@ def _decisions(skeleton: Skeleton, doubts: SearchDoubts) -> list[tuple[int, floa
 
 def _root_edit(skeleton: Skeleton, doubts: SearchDoubts) -> SetRoot | None:
     """What makes the other likely end the root; None where there is none."""
-    if doubts.other_root is None:
+    if len(doubts.root_ends) < 2:
         return None
-    away, node = cKDTree(skeleton.nodes).query(doubts.other_root)
+    away, node = cKDTree(skeleton.nodes).query(np.array(doubts.root_ends[1]["at"], float))
     if node == 0 or away > FAR * skeleton.radius[node]:
         return None
     return SetRoot(at=_place(skeleton.nodes[node]))
@@ -217,8 +215,9 @@ def open_questions(skeleton: Skeleton, doubts: SearchDoubts) -> list[DoubtfulPar
     for one in attachments(skeleton, doubts.bridges):
         if one.probability < OPEN:
             found.append(_part(skeleton, DoubtfulKind.attachment, one.node, one.probability))
-    if doubts.root_probability < OPEN and _root_edit(skeleton, doubts):
-        found.append(_part(skeleton, DoubtfulKind.root, 0, doubts.root_probability))
+    ends = doubts.root_ends
+    if len(ends) > 1 and ends[0]["probability"] < OPEN and _root_edit(skeleton, doubts):
+        found.append(_part(skeleton, DoubtfulKind.root, 0, ends[0]["probability"]))
     return found
 
 

@@ -89,10 +89,12 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
     return _with_probability(likeliest, shown, noise)
 
 
-def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
+def doubted(skeleton: Skeleton, points: np.ndarray, noise: float,
+            there: np.ndarray | None = None) -> Skeleton:
     """Return the skeleton with gaps and its nodes' probabilities; radii, which were not fitted,
-    stay. ``noise`` is the standard deviation of the points [m, 3] [m]."""
-    return _with_probability(skeleton, _Shown.of(skeleton, points, noise), noise)
+    stay. ``noise`` is the standard deviation of the points [m, 3] [m]; ``there`` the probability
+    [runs] that each run exists where its carrier does, if it is known."""
+    return _with_probability(skeleton, _Shown.of(skeleton, points, noise), noise, there)
 
 
 def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
@@ -122,15 +124,14 @@ def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
 
 
 def probability_given_carrier(skeleton: Skeleton) -> np.ndarray:
-    """Probability [runs] of each run, given that its carrier exists; 1 for the main run. That of a
-    run's nodes includes its carriers'."""
+    """Probability [runs] of each run, forked off there or elsewhere, given that its carrier exists;
+    1 for the main run. That of a run's nodes includes its carriers'."""
     runs = skeleton.runs()
     stated = np.array([skeleton.probability[members[1:]].max() for members in runs])
-    probability = np.ones(len(runs))
-    for run, members in enumerate(runs[1:], start=1):
-        carrier = int(skeleton.branch[members[0]])
-        probability[run] = stated[run] / (max(float(stated[carrier]), 1e-12) if carrier else 1.0)
-    return np.minimum(probability, 1.0)
+    carrier = skeleton.branch[[members[0] for members in runs]]
+    chance = stated / PLACED / np.where(carrier > 0, np.maximum(stated[carrier], 1e-12), 1.0)
+    chance[0] = 1.0
+    return np.minimum(chance, 1.0)
 
 
 def shares(skeleton: Skeleton) -> dict[str, float]:
@@ -171,19 +172,22 @@ def _node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndar
                             np.log1p(gap / radius), skeleton.radius_state == UNRESOLVED])
 
 
-def _with_probability(skeleton: Skeleton, shown: _Shown, noise: float) -> Skeleton:
+def _with_probability(skeleton: Skeleton, shown: _Shown, noise: float,
+                      there: np.ndarray | None = None) -> Skeleton:
     gap = _gaps(skeleton, shown)
     state = np.where(gap > 0, BRIDGED, skeleton.radius_state).astype(np.int8)
     with_state = replace(skeleton, radius_state=state)
+    if there is None:
+        there = _logistic(np.log1p(shown.unexplained)[:, None], _TWIG_ODDS)
     return replace(with_state, probability=_probability(
-        with_state, np.log1p(shown.unexplained)[:, None], _node_evidence(with_state, gap, noise)))
+        with_state, there, _node_evidence(with_state, gap, noise)))
 
 
-def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.ndarray:
+def _probability(skeleton: Skeleton, there: np.ndarray, node: np.ndarray) -> np.ndarray:
     """Probability that each node exists, with its run and carriers, and is in its position. A run's
     first node stands for its fork: the run's own evidence was fitted to that, and the node's gap
     and noise would count twice."""
-    own = PLACED * _logistic(twig, _TWIG_ODDS)
+    own = PLACED * there
     own[0] = 1.0
     placed, runs = _logistic(node, _NODE_ODDS), skeleton.runs()
     for run in range(1, skeleton.branch_count):

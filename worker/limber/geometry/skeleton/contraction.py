@@ -15,7 +15,7 @@ from limber.geometry.skeleton.curve_graph import CurveGraph, keep_largest, neigh
 from limber.geometry.skeleton.exact_factor import ExactFactor
 from limber.geometry.skeleton.joining import edge_matrix, join_pieces, labels
 from limber.geometry.skeleton.repair import PointSpacing, attached, resampled
-from limber.geometry.skeleton.run_ends import limited, tapered, with_full_tips
+from limber.geometry.skeleton.run_ends import tapered, with_full_tips
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 
 # Laplacian-based contraction: the cloud is drawn together onto the axes of its branches.
@@ -257,8 +257,7 @@ def _thickness(points: np.ndarray, owner: np.ndarray, nodes: np.ndarray, parent:
 _EVENED = 3  # rounds of smoothing
 
 
-def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float,
-                   radius_limits: tuple[float, float]) -> Skeleton:
+def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     """Place axes in the middle of stem and leaves without a fit, as leaves are no cylinders. A leaf
     gets its stalk's radius, for lack of a better one, marked as not measured."""
     skeleton = attached(resampled(skeleton, 1.0, PointSpacing.of(points).at(skeleton.nodes)))
@@ -268,7 +267,7 @@ def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float,
             old = skeleton.nodes[members]
             nodes[members[1:-1]] = 0.5 * old[1:-1] + 0.25 * (old[:-2] + old[2:])
         skeleton = skeleton.moved(nodes)
-    skeleton = with_full_tips(tapered(limited(skeleton, *radius_limits)), points, noise)
+    skeleton = with_full_tips(tapered(skeleton), points, noise)
     skeleton = replace(skeleton, radius_sigma=0.25 * skeleton.radius,
                        radius_state=np.full(skeleton.node_count, INTERPOLATED, np.int8))
     return doubted(skeleton, points, noise)

@@ -181,16 +181,19 @@ def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
     return main
 
 
+RIVAL = ("rival_from", "rival_to", "rival_price")
+"""Of a bridge in a report: where else it may lead."""
+
+
 def _bridge(joined: Joined, number: int) -> dict:
     """The report on a bridge, as in :class:`CurveGraph`."""
     one, other = joined.bridges[number]
     length, price = float(joined.lengths()[number]), float(joined.prices[number])
     thick, rival = float(joined.thickness[[one, other]].min()), joined.rivals[number]
+    places = (rival.end, rival.to, rival.price) if rival else (None, None, None)
     return {"from": joined.nodes[one], "to": joined.nodes[other], "length": length, "price": price,
             "thickness": thick, "probability": bridge_probability(bridge_evidence(
-                price, length, thick, rival.price if rival else None)),
-            "rival_from": rival.end if rival else None, "rival_to": rival.to if rival else None,
-            "rival_price": rival.price if rival else None}
+                price, length, thick, places[2])), **dict(zip(RIVAL, places, strict=True))}
 
 
 def _leave_away(graph: CurveGraph, main: np.ndarray, label: np.ndarray) -> None:

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.special import i0e, i1e
 
 from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.leaves import ALIKE
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.likelihood_kernels import densities, falling, left
@@ -77,9 +78,11 @@ def rival_tree(known: Skeleton, points: np.ndarray, view: View | None = None,
     for sharp in _SHARP:  # at once, thin axes would stay where their points are
         seen = replace(seen.turned(wide), sharp=sharp)
         wide = fitted(_spaced(wide, apart), seen, _STEPS)
-        starts.append((wide, seen))
-    starts.sort(key=lambda one: one[1].score(one[0]))
-    other, more, sighted, seen = likeliest_tree(*starts[-1], apart, progress.part(0.7, 1.0))
+        starts.append((seen.score(wide), wide, seen))
+    sighted, wide, seen = max(starts, key=itemgetter(0))
+    other = wide
+    if sighted > score:
+        other, more, sighted, seen = likeliest_tree(wide, seen, apart, progress.part(0.7, 1.0))
     if sighted > score + scan.twig_cost:  # it has numbers too
         scan, skeleton, other, count = seen, other, skeleton, count + more
     skeleton = fitted(_spaced(skeleton, apart), scan, _LAST_STEPS)
@@ -87,14 +90,17 @@ def rival_tree(known: Skeleton, points: np.ndarray, view: View | None = None,
     few, many = (State.of(spaced, replace(scan, twig_numbers=each)) for each in (
         _DEARER * cost, cost / _DEARER))
     unknown = np.log(grown(many, apart).skeleton.length / drawn_back(pruned(few)).skeleton.length)
+    last = drawn_back(pruned(State.of(skeleton, scan)))
+    skeleton, chances = last.skeleton, last.chances
     residual = nearest_cylinders(skeleton, points)[1]
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
     if rays := scan.sight is not None:
         # One sensor's rays show widths, which the noise along its sight leaves as they are.
         skeleton, _ = by_projected_widths(skeleton, points, view)
     found = assessed(skeleton.on_grid(), points, noise, rays=rays, view=view if rays else None)
-    even, kinks = without_kinks(found)
-    return doubted(even, points, noise) if kinks else found, noise, count, float(np.linalg.norm(
+    even, _ = without_kinks(replace(found, probability=chances[skeleton.branch]))
+    there = even.probability[[own[0] for own in even.own_runs()]]
+    return doubted(even, points, noise, there), noise, count, float(np.linalg.norm(
         [_APART, unknown / 2, np.log(other.length / skeleton.length) / 2]))
 
 
@@ -286,6 +292,19 @@ class State:
         """Its score."""
         return self.scan.log(self.wood, self.scatter, float(self.skin.sum()),
                              self.skeleton.branch_count) - float(self.turns.sum())
+
+    @property
+    def chances(self) -> np.ndarray:
+        """Probability [runs] that each run exists where its carrier does, by how much the score
+        falls without it and what it carries: neighbouring points count once for all."""
+        run, carrier = self.skeleton.branch, self.skeleton.branch[self.skeleton.parent]
+        mine = run == np.arange(self.skeleton.branch_count)[:, None]
+        odds = np.full(len(mine), np.inf)
+        for each in range(len(mine) - 1, 0, -1):  # a run carried by another has a higher number
+            odds[each] = (self.log - self.without(mine[each], len(np.unique(run[mine[each]])))
+                          ) / ALIKE
+            mine[carrier[np.argmax(run == each)]] |= mine[each]
+        return 1 / (1 + np.exp(-odds))
 
     def without(self, nodes: np.ndarray, runs: int = 0) -> float:
         """The score without nodes, a mask [n], whose children are all among them; ``runs`` of them

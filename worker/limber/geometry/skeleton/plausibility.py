@@ -54,16 +54,13 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str)
                 "cluster (", Option("plants", "largest"), ").")
 
 
-def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
-                residual: np.ndarray) -> None:
-    """Refuse a cloud with axes but without round sections (a ball). Leaves give a warning only."""
-    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    round_share = float(np.mean(np.abs(residual) < 0.4 * skeleton.radius[segment]))
+def check_slender(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
+                  residual: np.ndarray) -> None:
+    """Refuse a cloud far from its axes (a ball). Leaves give a warning only."""
     away = float(np.median(np.abs(residual + skeleton.radius[segment])))
-    if round_share < 0.15 and away > _STOUT * extent:
+    if away > _STOUT * float(np.linalg.norm(np.ptp(points, axis=0))):
         raise InputError(
-            f"Only {100 * round_share:.0f} % of the points lie on round axes. The points have a "
-            f"median distance of {away:.3g} m from their axes.",
+            f"The points have a median distance of {away:.3g} m from their axes.",
             "The cloud does not have the shape of a branch.", _FIX)
 
 

@@ -16,7 +16,6 @@ from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.radii.stations import registered
 from limber.geometry.skeleton.run_ends import (
     ends_within,
-    limited,
     steadied,
     with_full_tips,
     without_bare_ends,
@@ -276,7 +275,6 @@ class Repaired:
 
     Attributes:
         points: The scan, thinned, its stations registered [m], shape [m, 3].
-        radius_limits: Least and largest radius [m].
         view: The depth camera's view of the points, if they are one's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
@@ -285,7 +283,6 @@ class Repaired:
 
     skeleton: Skeleton
     points: np.ndarray
-    radius_limits: tuple[float, float]
     view: View | None = None
     rays: bool = False
     fit: AxisFit | None = None
@@ -360,8 +357,6 @@ def _mend_kinks(now: Repaired) -> Repaired:
 
 # Where points are missing, a first radius is far too small.
 STEADY = Pass("steady radii", lambda now: now.of(steadied(now.skeleton, now.points)))
-# A radius is outside the range for a cloud of this size.
-LIMIT = Pass("limit radii", lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
 
 PASSES = (
     STEADY,
@@ -373,7 +368,6 @@ PASSES = (
     Pass("lengthen ends",
          lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
     STEADY,
-    LIMIT,
     # Axes and radii come from too few nodes, and from forks that have moved since.
     Pass("fit finely", lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False),
          until=0.8),
@@ -384,7 +378,6 @@ PASSES = (
     # A fit moves an end along its axis beyond the points; nodes without points go first.
     Pass("draw ends back", lambda now: now.of(
         ends_within(without_bare_ends(now.skeleton, now.points), now.points))),
-    LIMIT,
     # A radius that few points, the spacing or the noise determine, or that no wood has, is treated
     # as measured.
     Pass("find the likeliest axes and radii", lambda now: now.of(assessed(
@@ -396,11 +389,11 @@ PASSES = (
 """In the order in which they run; some run again after a fit."""
 
 
-def repaired(skeleton: Skeleton, points: np.ndarray, radius_limits: tuple[float, float],
-             view: View | None, progress: Progress = SILENT) -> Repaired:
+def repaired(skeleton: Skeleton, points: np.ndarray, view: View | None,
+             progress: Progress = SILENT) -> Repaired:
     """Run all passes on the skeleton, with first radii, of the contracted points. ``points``
     [m, 3] [m] are the scan, thinned; ``view`` is the depth camera's, if they are one's."""
-    now = Repaired(skeleton, points, radius_limits, view)
+    now = Repaired(skeleton, points, view)
     done = 0.0
     for each in PASSES:
         until = done if each.until is None else each.until

@@ -129,14 +129,6 @@ def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
     return replace(skeleton, radius=radius)
 
 
-def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
-    """Return the skeleton with radii limited to [low, high] [m], those nodes marked: the paper's
-    rule r in [alpha D, beta D], with the cloud's scale D."""
-    outside = (skeleton.radius < low) | (skeleton.radius > high)
-    state = np.where(outside, LIMITED, skeleton.radius_state).astype(np.int8)
-    return replace(skeleton, radius=np.clip(skeleton.radius, low, high), radius_state=state)
-
-
 def tapered(skeleton: Skeleton, count: np.ndarray | None = None) -> Skeleton:
     """Return the skeleton with radii that hardly grow towards tips, changed nodes marked: no more
     than the carrier's at a run's start, nor than 1.25 times the median so far, at its tip that

@@ -68,11 +68,6 @@ class SkeletonResult:
         return self.root_ends[0]["probability"] if self.root_ends else 1.0
 
     @property
-    def other_root(self) -> np.ndarray | None:
-        """The next likely end [m], shape [3]; None where the root is sure."""
-        return self.root_ends[1]["at"] if len(self.root_ends) > 1 else None
-
-    @property
     def warnings(self) -> list[str]:
         """Warnings for the user, with positions in the result's frame."""
         return warnings(self)
@@ -80,8 +75,7 @@ class SkeletonResult:
     @property
     def doubts(self) -> SearchDoubts:
         """What the search left open."""
-        return SearchDoubts(self.bridges, self.unlikely, self.other_root, self.root_probability,
-                            self.length_spread)
+        return SearchDoubts(self.bridges, self.unlikely, self.root_ends, self.length_spread)
 
     def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
         """Return the result in another frame; ``move`` transforms points [n, 3] to it."""
@@ -103,7 +97,6 @@ class SkeletonResult:
                 "doubtful_run_count": len({int(run) for run in self.skeleton.branch[
                     self.skeleton.probability < 0.5]}), "split_off": self.split_off,
                 "unlikely_twigs": self.unlikely, "root_ends": self.root_ends,
-                "other_root": self.other_root,
                 "root_probability": self.root_probability, "length_spread": self.length_spread,
                 "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
 

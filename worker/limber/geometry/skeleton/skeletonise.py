@@ -21,11 +21,11 @@ from limber.geometry.skeleton.contraction import (
     level_graph,
     through_leaves,
 )
-from limber.geometry.skeleton.curve_graph import CurveGraph, curve_graph, rooted
+from limber.geometry.skeleton.curve_graph import RIVAL, CurveGraph, curve_graph, rooted
 from limber.geometry.skeleton.edits import SetRoot, edited
 from limber.geometry.skeleton.joining import second_base
 from limber.geometry.skeleton.likeliest_tree import rival_tree
-from limber.geometry.skeleton.plausibility import check_no_sheet, check_one_plant, check_round
+from limber.geometry.skeleton.plausibility import check_no_sheet, check_one_plant, check_slender
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.repair import SPUR_REACH, Repaired, prune_spurs, repaired
 from limber.geometry.skeleton.root_end import RootChoice, root_node
@@ -131,8 +131,7 @@ class _Search:
         if shape > 0:
             rivals.append(self.pruned(*self.in_levels(fitted.points, graph.nodes[start], float(
                 np.median(graph.thickness))))[0])
-        best = max((through_leaves(one, some, fitted.noise, fitted.radius_limits)
-                    for one in rivals), key=scan.score)
+        best = max((through_leaves(one, some, fitted.noise) for one in rivals), key=scan.score)
 
         def lead(scan: PointLikelihood) -> float:
             return scan.score(best) - (scan.score(fitted.skeleton) + scan.score(wood)) / 2
@@ -172,25 +171,26 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
         graph.loops = loops
     first, pruned = search.pruned(graph, start)
     some = search.to_fit(graph, thin)
-    fitted = repaired(first, some, settings.radius_limits(search.diagonal), view,
-                      progress.part(0.65, 0.95))
+    fitted = repaired(first, some, view, progress.part(0.65, 0.95))
     wood, (skeleton, unlikely) = fitted.skeleton, likely(fitted.skeleton, twig_probability)
-    noise, count, spread = fitted.noise, pruned, None
+    noise, count, spread, bridges = fitted.noise, pruned, None, graph.bridges
     if len(points) <= SEARCHED:
         wood, noise, count, spread = rival_tree(skeleton, some, view, progress.part(0.95, 1.0))
         skeleton, unlikely = wood, []
+        # It has compared paths over gaps: of the first ones' odds none are left.
+        bridges = [bridge | dict.fromkeys(RIVAL) for bridge in bridges]
     segment, residual = nearest_cylinders(wood, points)
-    check_round(wood, points, segment, residual)
+    check_slender(wood, points, segment, residual)
     if leafy := (middle := search.through_leaves(first, fitted, wood, graph, start)) is not None:
         skeleton, unlikely = likely(middle, twig_probability)
-        noise, count, spread = fitted.noise, pruned, None
+        noise, count, spread, bridges = fitted.noise, pruned, None, graph.bridges
     if skeleton is not wood:
         segment, residual = nearest_cylinders(skeleton, points)
     if len(ends) > 1 and ends[0]["probability"] < OPEN and not leafy:
         skeleton = _of_either_root(skeleton, fitted, ends)
     progress(1.0, "skeleton", nodes=skeleton.node_count)
-    return SkeletonResult(skeleton, contraction, segment, residual, noise, graph.bridges,
-                          graph.split_off, graph.loops, count, second_base(skeleton, up), ends,
+    return SkeletonResult(skeleton, contraction, segment, residual, noise, bridges, graph.split_off,
+                          graph.loops, count, second_base(skeleton, up), ends,
                           leafy, unlikely, spread)
 
 

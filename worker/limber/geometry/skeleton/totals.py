@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from limber.geometry.skeleton.alternatives import SearchDoubts, attachments
-from limber.geometry.skeleton.confidence import PLACED, probability_given_carrier
+from limber.geometry.skeleton.confidence import probability_given_carrier
 from limber.geometry.skeleton.qsm_tables import cylinders
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 
@@ -104,9 +104,9 @@ def totals(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> dict[str
 
 def _of_tree(skeleton: Skeleton, own: np.ndarray, variance: np.ndarray, odds: float = 0.0,
              ) -> tuple[float, float]:
-    """Mean and variance of a sum of runs' ``own`` values [runs], of given ``variance``. A run needs
-    its carrier, or a fork elsewhere. ``odds`` is added to the logarithm of all odds."""
-    chance = _moved(np.minimum(probability_given_carrier(skeleton) / PLACED, 1.0), odds)
+    """Mean and variance of a sum of runs' ``own`` values [runs], of given ``variance``. ``odds`` is
+    added to the logarithm of all odds."""
+    chance = _moved(probability_given_carrier(skeleton), odds)
     mean, spread = own.astype(float), variance.astype(float)
     # A run carried by another one has a higher number.
     runs = skeleton.runs()

@@ -6,8 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.settings import SkeletonSettings
-from limber.geometry.skeleton.run_ends import limited
-from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, MEASURED, Skeleton
 
 
 def nearest_point_radii(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings,
@@ -26,7 +25,7 @@ def nearest_point_radii(skeleton: Skeleton, points: np.ndarray, settings: Skelet
     distance = cKDTree(points).query(skeleton.nodes, k=count)[0].reshape(-1, count)
     radius = np.median(distance, axis=1)
     sigma = np.hypot(skeleton.radius_sigma, radius - skeleton.radius)
-    state = np.full(skeleton.node_count, MEASURED, np.int8)
-    scale = float(np.linalg.norm(np.ptp(points, axis=0)))
-    return limited(replace(skeleton, radius=radius, radius_sigma=sigma, radius_state=state),
-                   *settings.radius_limits(scale))
+    limits = np.array(settings.radius_range) * np.linalg.norm(np.ptp(points, axis=0))
+    kept = np.clip(radius, *limits)
+    return replace(skeleton, radius=kept, radius_sigma=sigma, radius_state=np.where(
+        kept == radius, MEASURED, LIMITED).astype(np.int8))
