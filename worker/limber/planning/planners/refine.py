@@ -68,9 +68,10 @@ _FAR = 10.0  # relative excess above which heavier weights change nothing
 _HEAVIER = 25.0  # from round to round, where limits are not kept much better than before
 _BETTER = 0.25
 _SETTLED = 3e-4  # change of the cost in a round, relative
-_MARGINS = (2e-5, 3e-4, 2e-3)  # [m] distance kept from the limits; the next if one was not enough
+_MARGINS = (2e-5, 3e-4, 8e-4, 2e-3)  # [m] kept from the limits; the next if one was not enough
 _FIRST_STEP = 0.1  # fraction of an edge: the first step, without known curvature
 _FLAT = 1e-8  # slope in those units, for a cost of about 1
+_LEVEL = 1e-7  # relative gain in an iteration that ends a round: finer takes twice as long
 _INSIDE = 1e-3  # fraction of the goal's tolerance by which an end lies inside; at most the margin
 _STEP = 1e-5  # [m] of the two finite differences
 _SAME_WAY = 0.05  # fraction of a path's length; another path around a ridge is farther away
@@ -119,6 +120,7 @@ def _moved(path: np.ndarray, limits: "Excesses") -> tuple[np.ndarray, float]:
     for _ in range(_ROUNDS):
         flat = resample(flat, max(np.linalg.norm(np.diff(flat, axis=0), axis=1).sum(), 1e-6)
                         / _EDGES)
+        limits.steep = max(1.0, float(np.linalg.norm(limits.outward(line.points(flat[-2:])[-1]))))
         flat, cost = line.settle(flat, limits)
         over = limits.push(line.points(flat))
         if over <= 0.5 * limits.reserve and abs(cost - before) <= _SETTLED * abs(cost):
@@ -168,7 +170,7 @@ class _Line:
 
         found = scipy.optimize.minimize(
             cost, (edges / units).ravel(), jac=True, method="L-BFGS-B",
-            options={"maxiter": _ITERATIONS, "maxcor": 20, "gtol": _FLAT})
+            options={"maxiter": _ITERATIONS, "maxcor": 20, "gtol": _FLAT, "ftol": _LEVEL})
         flat = moved(found.x)
         return flat, smooth_cost(self.points(flat), self.problem.energy_field,
                                  self.problem.weights)[0]
@@ -191,11 +193,13 @@ def _along(outward: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
 @dataclass
 class Excesses:
     """The limits on a path's points and their multipliers. Points within ``margin`` [m] of trust's
-    border, and an end off the goal, are over; energy, force and length are relative."""
+    border are over; energy and force are relative. The least margin is enough for end and length,
+    which do not change between points."""
 
     problem: GentleProblem
     margin: float
     heavier: float = 1.0
+    steep: float = 1.0  # growth of the goal's excess per metre: a target may move 30 times as far
     multipliers: list[np.ndarray] = field(default_factory=list)
 
     @property
@@ -261,8 +265,8 @@ class Excesses:
                     outward = side * np.eye(3)[axis] / scale
                     yield _Excess((side * (points[:, axis] - bound) + self.margin) / scale,
                                   _along(outward))
-        inside = min(_INSIDE * problem.goal.tolerance, self.margin)
-        outside = (problem.goal_excess(points[-1]) + inside) / scale
+        inside = min(_INSIDE * problem.goal.tolerance, _MARGINS[0])
+        outside = (problem.goal_excess(points[-1]) / self.steep + inside) / scale
         yield _Excess(np.array([outside]), lambda push: self._at_end(points, push))
         if problem.longest < np.inf:
             yield self._on_length(points)
@@ -278,11 +282,15 @@ class Excesses:
             yield _Excess(one.share(points) - 1.0 + self.reserve, partial(pull, one), _WEIGHTS[1])
 
     def _at_end(self, points: np.ndarray, push: np.ndarray) -> np.ndarray:
-        shifts = _STEP * np.concatenate([np.eye(3), -np.eye(3)])
-        excess = self.problem.goal.excess(self.problem.energy_field, points[-1] + shifts)
         out = np.zeros_like(points)
-        out[-1] = push[0] * (excess[:3] - excess[3:]) / (2.0 * _STEP * self.scale)
+        out[-1] = push[0] * self.outward(points[-1]) / (self.steep * self.scale)
         return out
+
+    def outward(self, end: np.ndarray) -> np.ndarray:
+        """Return the gradient of the goal's excess at an end [3]."""
+        shifts = _STEP * np.concatenate([np.eye(3), -np.eye(3)])
+        excess = self.problem.goal.excess(self.problem.energy_field, end + shifts)
+        return (excess[:3] - excess[3:]) / (2.0 * _STEP)
 
     def _on_length(self, points: np.ndarray) -> _Excess:
         edges = np.diff(points, axis=0)
@@ -294,7 +302,7 @@ class Excesses:
             out[1:] += along
             out[:-1] -= along
             return out
-        return _Excess(np.array([(lengths.sum() + self.margin) / self.problem.longest - 1.0]), pull)
+        return _Excess(np.array([(lengths.sum() + _MARGINS[0]) / self.problem.longest - 1.0]), pull)
 
 
 # The gentlest path with its certificate: eikonal descent, refinement, bound.
