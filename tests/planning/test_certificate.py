@@ -431,7 +431,7 @@ def test_a_plan_is_bounded_closely_once_it_holds(ridge_field):
 def test_a_detour_may_count_from_the_tree(ridge_field):
     """As in the paper's table: the path of RRT* as its tree has it is longer than the shortest."""
     settings = PlanSpec(iterations=300, engine="own", max_detour=2.0)
-    shortest, tree = (plan_pair(ridge_field, START, GOAL, settings, detour_from_tree=from_tree)
+    shortest, tree = (plan_pair(ridge_field, START, GOAL, settings, is_compared=from_tree)
                       for from_tree in (False, True))
     raw = arc_lengths(resample(tree.compared["RRT*, not smoothed"], 0.005))[-1]
     assert tree.detour.longest == pytest.approx(1.02 * raw)
@@ -451,7 +451,7 @@ def test_costs_of_two_seeds_compare(ridge_field):
     assert first.lower == pytest.approx(second.lower, rel=0.01)
     assert first.upper <= second.upper * (1 + 1e-6)
     assert max(first.lower, second.lower) <= first.upper
-    assert set(found[0].compared) == {"straight line", "eikonal", "RRT*", "RRT*, not smoothed",
+    assert set(found[1].compared) == {"straight line", "eikonal", "RRT*", "RRT*, not smoothed",
                                       "D-RRT*", "D-RRT*, not smoothed"}
 
 

@@ -104,8 +104,8 @@ def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
 @pytest.mark.usefixtures("coarse_bound")
 @pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGKILL])
 def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
-    """While both paths are solved on the full model."""
-    ask = (folder, "--start-seed", "3", "--name", "new")
+    """While the motion is simulated, there and back."""
+    ask = (folder, "--start-seed", "3", "--max-force", "1e3", "--name", "new")
     before = Branch.open(folder).names("plans")
     killed_at_work(command("plan", *ask), kind)
     assert Branch.open(folder, verify=True).names("plans") == before

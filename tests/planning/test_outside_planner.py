@@ -20,7 +20,7 @@ def test_a_planner_from_outside_finds_the_baseline(planned_branch, tmp_path, mon
     prefers those that are there."""
     install(tmp_path / "site", monkeypatch)
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
-    done = Planned(branch_folder=folder, name="line", engine="line").run()
+    done = Planned(branch_folder=folder, name="line", engine="line", planner="d-rrt-star").run()
     shortest, gentle = sys.modules["outside.things"].Line.searched
     forget()
     assert shortest.weights.energy == 0.0 < gentle.weights.energy

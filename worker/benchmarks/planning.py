@@ -251,19 +251,16 @@ def _bound_rows(trials: list[Trial]) -> list[Row]:
     good = sound(trials)
     if not good:
         return [Row(*asked, _troubles(trials), False, len(trials)) for asked in _BOUND_ROWS]
-    gaps, ratio, below, tree = (column(good, name) for name in (
-        "gap", "to_optimum", "bound_to_optimum", "tree_to_optimum"))
-    gaps, tree = 100 * gaps, 100 * (tree[np.isfinite(tree)] - 1)
+    gaps, ratio, below = (column(good, name) for name in ("gap", "to_optimum", "bound_to_optimum"))
+    gaps = 100 * gaps
     return [
         Row(*_BOUND_ROWS[0], _troubles(trials) or "100 %", len(good) == len(trials), len(trials)),
         Row(*_BOUND_ROWS[1], spread(gaps, " %", 2),
             bool(np.median(gaps) <= 1.5 and gaps.max() <= 3.0), len(gaps)),
-        Row(*_BOUND_ROWS[2], f"{spread(tree, ' %')}, {(tree <= 2).sum()} of {len(tree)} within"
-            if len(tree) else "none", bool(len(tree) and np.median(tree) <= 2), len(tree)),
-        Row(*_BOUND_ROWS[3],
+        Row(*_BOUND_ROWS[2],
             f"{100 * (ratio.max() - 1):.3f} % (best {100 * (ratio.min() - 1):.3f} %)",
             bool(ratio.max() <= 1.01), len(ratio)),
-        Row(*_BOUND_ROWS[4], f"bound at most {below.max():.4f} of the best",
+        Row(*_BOUND_ROWS[3], f"bound at most {below.max():.4f} of the best",
             bool(below.max() <= 1.0 + 1e-9), len(below))]
 
 
@@ -363,11 +360,10 @@ _FROM_REST = Asked("from rest, all branches: saved against the straight line", "
 _BOUND_ROWS = (
     Asked("success where a path exists", "100 %"),
     Asked("certified gap, median / worst", "1.5 / 3 %"),
-    Asked("the same: D-RRT* of 3,000 iterations, over the best, median / worst", "2 %"),
     Asked("cost over an independent optimum's, worst", "1 %"),
     Asked("no path below the bound", "never"))
 _TIME_ROWS = (
-    Asked("in: RRT*, D-RRT*, plan and bound, median / worst, two at once", "10 s"),
+    Asked("in: RRT*, plan and bound, median / worst, two at once", "10 s"),
     Asked("planning after the field to within 2 % of the best: eikonal, median / worst", "1 s"),
     Asked("full-model check of both paths, median / worst, one process, two at once", "10 s"))
 _FULL_ROWS = (

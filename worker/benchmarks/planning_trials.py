@@ -165,7 +165,7 @@ def _measure(start: Start, place: np.ndarray, settings: PlanSpec,
     points = motion.plan.solved.poses[:, :3]
     cost, best = problem.cost(points), best_cost(problem, _OPTIMUM_STARTS, settings.seed)
     on_field = summary["paths_on_field"]
-    gentle, tree = on_field["eikonal"], on_field.get("D-RRT*")
+    gentle = on_field["eikonal"]
     others = {name: path for name, path in on_field.items()
               if name.startswith("RRT*") or name == "straight line"}
     return {
@@ -177,8 +177,6 @@ def _measure(start: Start, place: np.ndarray, settings: PlanSpec,
         "to_optimum": cost / best, "bound_to_optimum": certificate["lower_bound"] / min(best, cost),
         "seconds_to_close": min((level["seconds"] for level in certificate["levels"]
                                  if level["upper"] <= 1.02 * best), default=np.nan),
-        "tree_to_optimum": (weights.energy * tree["energy_integral_jm"] + weights.length
-                            * tree["length_m"]) / best if tree else np.nan,
         "saved": {name: 100.0 * (1.0 - gentle["energy_integral_jm"] / path["energy_integral_jm"])
                   for name, path in others.items()},
         "added": {name: 100.0 * (gentle["length_m"] / path["length_m"] - 1.0)
@@ -289,7 +287,7 @@ def run_detour(start: Start) -> dict[str, Any]:
     """Plan within the paper's detour: savings [%], and the most points by which they could grow."""
     known, settings = start.known, PlanSpec(seed=start.seed, max_detour=ADDED)
     place, began = start.place(settings), time.process_time()
-    pair = plan_pair(known, place, start.goal, settings, detour_from_tree=True)
+    pair = plan_pair(known, place, start.goal, settings, is_compared=True)
     seconds = time.process_time() - began
     own_length, own = _measured(pair.plan.points, known)
     assert pair.detour is not None

@@ -52,8 +52,10 @@ from limber.planning.settings import PlanSettings
 #     I >= B(w) - w L        for any w
 #
 # (weak duality: Boyd and Vandenberghe 2004, 5.2). If the length does not constrain the path, the
-# smallest weights give the best bound. If it does, the best weight is the saving per additional
-# metre: the slope of the gentlest path's energy over the length. If the length jumps at a weight
+# smallest weights give the best bound. Any path of length l and energy E keeps B(w) - w L below
+# E + w (l - L): the best weight is where the least of these is greatest, between a path that is
+# too long and one that is not (the cutting planes of Kelley 1960). Paths refined at that weight
+# cut further; a refinement takes a hundredth of a bound's time. If the length jumps at a weight
 # (energy over length is not convex: one path round a ridge, or the other), the remaining gap of
 # the bound is the jump's.
 #
@@ -62,8 +64,10 @@ from limber.planning.settings import PlanSettings
 
 _LIGHT = 1e-2  # fraction of the given weight of a metre: energy alone counts, nearly
 _HEAVY = 1e3  # the same: length alone counts
-_SHORTER = (0.99, 0.97)  # fractions of the allowed length, for the slope of energy over length
 _BINDS = 0.998  # fraction of the allowed length above which the length binds
+_TIE = 0.004  # fraction of the bound for which a heavier weight is taken, which parts two paths
+_SHORTER = 0.97  # fraction of the allowed length, for what the last metre saves
+_CUTS, _WORTH = 6, 1.002  # refinements at the best weight; the factor that counts as a cut
 _ENOUGH = 0.02  # gap of the energy below which a finer grid is not worth its time
 _UNUSED = 0.004  # fraction of the energy that the weight of an unused length may cost the bound
 _FINEST_GAP = 1e-3  # gap of the weighted cost that is asked for
@@ -72,7 +76,6 @@ _LADDER = (1.0, 1.0 / 3.0, 3.0)
 _APART = 1.5  # ratio of two weights that have a bound each
 _LOOSE = 3.0  # factor on the gap asked of the other weights
 _MOST_BOUNDS = 3
-_STRIDE = 2.5
 _SPACING = 0.001  # [m] spacing of a path's integral
 
 
@@ -137,49 +140,74 @@ class _Search:
         self.problem, self.longest = problem, longest
         self.path, self.shortest = shortest, shortest
         self.length, self.integral = _measured(shortest, problem)
-        self.slope = 0.0  # [J] saved by one more metre
+        self.known: list[tuple[np.ndarray, float, float]] = []  # paths, lengths, integrals
         self.curve: list[TradePoint] = []
         self.best: GentlePath | None = None
         self.best_weight, self.value = np.nan, -np.inf
         self.levels: list[dict[str, float]] = []
-        self.binds = False
-        self.low: tuple[float, float, float] | None = None  # weight, length and integral
-        self.high: tuple[float, float, float] | None = None
 
     def begin(self, others: list[np.ndarray]) -> None:
-        """Find the gentlest path from those known, and the saving per additional metre. NoPathError
-        if the shortest path is not allowed."""
+        """Find the gentlest path from those known, and paths that cut what a bound may prove.
+        NoPathError if the shortest path is not allowed."""
         light = _weighed(self.problem, _LIGHT)
         free = distinct([refine(path, light)[0] for path in distinct([*others, self.shortest])])
-        limited = replace(light, longest=self.longest)
         for path in free:
             self._take(path)
         for path in distinct([*others, self.shortest, *free]):
-            self._take(refine(path, limited)[0])
-        if not np.isfinite(limited.cost(self.path)):
+            self._take(self._shortened(path))
+        if not np.isfinite(replace(light, longest=self.longest).cost(self.path)):
             raise NoPathError("No allowed path was found as a starting point.",
                               "Refinement of the known paths ended outside the limits.",
                               "Sample more poses with ", Command("energy", Option("samples")), ".")
         for path in free:
             self._note(_LIGHT, *_measured(path, self.problem))
-        gentlest = min(self.curve, key=lambda point: point.energy_integral_jm)
-        self.binds = max(self.length / _BINDS, gentlest.length_m) >= self.longest
-        if not self.binds:
-            return
-        for share in _SHORTER:
-            path, cost = refine(self.path, replace(light, longest=share * self.longest))
-            if np.isfinite(cost):
-                length, integral = _measured(path, self.problem)
-                if length < self.length:
-                    self.slope = max((integral - self.integral) / (self.length - length), 0.0)
-                    self._note(self._own_weight(), length, integral)
-                    break
+        shorter = self._shortened(self.path, _SHORTER)
+        self.known += [(path, *_measured(path, self.problem)) for path in (
+            *free, self.shortest, shorter) if np.isfinite(light.cost(path))]
+        self._cut()
+
+    def _cut(self) -> None:
+        """Refine paths at the best weight until they hardly lower what a bound may prove."""
+        for _ in range(_CUTS):
+            metre, before, ends = self._best()
+            for number in ends:
+                path, cost = refine(self.known[number][0], _weighed(
+                    self.problem, metre / self._metre))
+                if np.isfinite(cost):
+                    self._take(path)
+                    self.known.append((path, *_measured(path, self.problem)))
+            if self._best()[1] * _WORTH >= before:
+                break
+        for number in self._best()[2][:1]:
+            self._take(self._shortened(self.known[number][0]))
+
+    def _shortened(self, path: np.ndarray, share: float = 1.0) -> np.ndarray:
+        """Return a path refined to the gentlest of a ``share`` of the allowed length."""
+        return refine(path, replace(_weighed(self.problem, _LIGHT),
+                                    longest=share * self.longest))[0]
+
+    def _best(self) -> tuple[float, float, list[int]]:
+        """Return the cost of a metre [J] at which the known paths allow the greatest bound of the
+        energy, that bound [J m], and which of them meet there."""
+        lengths, integrals = np.array([one[1:] for one in self.known] + [
+            (self.length, self.integral)]).T
+        spare = max(self.longest - self.length, (1.0 - _BINDS) * self.longest)
+        metres = [min(_UNUSED * self.integral / spare, self.integral / self.longest)]
+        saved, added = np.subtract.outer(integrals, integrals), np.subtract.outer(lengths, lengths)
+        metres += [*-(saved / np.where(added == 0.0, 1.0, added))[(saved > 0.0) & (added < 0.0)]]
+        values = integrals + np.multiply.outer(metres, lengths - self.longest)
+        # Where two paths meet, both are in the bound's tube; beyond, the shorter one alone.
+        least = values.min(axis=1)
+        best = max(np.flatnonzero(least >= (1.0 - _TIE) * least.max()), key=metres.__getitem__)
+        ends = [int(some[values[best, some].argmin()]) for some in (
+            np.flatnonzero(lengths > self.longest), np.flatnonzero(lengths <= self.longest))
+            if len(some)]
+        return metres[best], float(least.max()), [
+            number for number in ends if number < len(self.known)]
 
     def first_weights(self) -> list[float]:
         """Return the weights of the first bounds: the question's, then those of the trade-off."""
-        spare = max(self.longest - self.length, (1.0 - _BINDS) * self.longest)
-        light = _UNUSED * self.integral / spare
-        weights = [max(self.slope, min(light, self.integral / self.longest)) / self._metre]
+        weights = [self._own_weight()]
         length, integral = _measured(self.shortest, self.problem)
         if self.length > length and integral > self.integral:
             mean = (integral - self.integral) / (self.length - length) / self._metre
@@ -194,7 +222,7 @@ class _Search:
 
     def _own_weight(self) -> float:
         """Return the weight at which the path would be the gentlest."""
-        return max(self.slope / self._metre, _LIGHT)
+        return self._best()[0] / self._metre
 
     def bound(self, weights: Sequence[float], progress: Progress) -> float | None:
         """Bound at the first of ``weights``, and less closely at the others; return the next one,
@@ -207,25 +235,11 @@ class _Search:
             self._take(one.points)
         for weight, one in zip(weights, every, strict=True):
             self._bounded(weight, one)
-        weight, found = weights[0], every[0]
-        if found.certificate.stopped or self.integral <= (1.0 + _ENOUGH) * self.value:
+        if every[0].certificate.stopped or self.integral <= (1.0 + _ENOUGH) * self.value:
             return None
-        metre, energy = weight * self._metre, self.problem.weights.energy
-        length, integral = _measured(found.points, self.problem)
-        spare = metre * (self.longest - length)
-        uncertainty = (found.cost - found.certificate.lower) / energy
-        if spare > uncertainty:
-            self.high = weight, length, integral
-        elif self.binds:
-            self.low = weight, length, integral
-        else:
-            return None
-        if self.low is None or self.high is None:
-            return weight * _STRIDE if self.high is None else weight / _STRIDE
-        # Between the two paths, the best weight is what a metre saves from one to the other.
-        (low, longer, less), (high, shorter, more) = self.low, self.high
-        saved = (more - less) / max(longer - shorter, 1e-12) / self._metre
-        return saved if low < saved < high else float(np.sqrt(low * high))
+        self._cut()
+        following = self._own_weight()
+        return None if 1.0 / _APART < following / weights[0] < _APART else following
 
     def _enough(self, weight: float) -> float:
         """Return the gap of the weighted cost with which the energy, a part of it, has its own."""
@@ -408,11 +422,12 @@ def _margin_text(margins: dict[str, float]) -> str:
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
               limits: FieldArrays | None = None, *, sure: FieldArrays | None = None,
               asked_goal: Goal | None = None, before: PathPair | None = None,
-              detour_from_tree: bool = False, is_bounded: bool = True,
+              is_compared: bool = False, is_bounded: bool = True,
               progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits (None: the settings'), and bound any path
-    (:class:`~.path_problem.GentleProblem`). The largest detour counts from the shortest path, or
-    RRT*'s as in the paper. InputError if the start is not allowed, NoPathError if none."""
+    (:class:`~.path_problem.GentleProblem`). The largest detour counts from the shortest path; if
+    planners are compared, from that of RRT*, as in the paper. InputError if the start is not
+    allowed, NoPathError if none."""
     limits = limits or Limits.of(settings).on(field)
     check_start(field, start, limits)
     if goal.excess(field, start[None])[0] <= 0.0:
@@ -429,12 +444,12 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     problem = GentleProblem(field, limits, weighed.weights, start, goal, sure=sure,
                             asked_goal=asked_goal)
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
-                   progress.part(0.0, 0.5)) if nobody is None else {}
+                   is_compared, progress.part(0.0, 0.5)) if nobody is None else {}
     try:
         known = [path.points for path in trees.values()]
         if before is not None:
             known.append(before.plan.points)
-        tree = trees["RRT*"].raw if detour_from_tree and "RRT*" in trees else None
+        tree = trees["RRT*"].raw if is_compared and "RRT*" in trees else None
         gentle, detour = _gentle(problem, known, tree, settings, ENOUGH if is_bounded else _ANY,
                                  progress.part(0.5, 1.0))
     except BlockedError as error:
@@ -524,14 +539,16 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | 
 
 
 def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
-           weighed: CostWeights, before: dict[str, FoundPath], progress: Progress,
-           ) -> dict[str, FoundPath]:
-    """Return the results of RRT* and D-RRT*, new or from before: either, both or none."""
+           weighed: CostWeights, before: dict[str, FoundPath], is_compared: bool,
+           progress: Progress) -> dict[str, FoundPath]:
+    """Return the results of RRT*, and of D-RRT* if it ``is_compared`` or plans, new or from
+    before: either, both or none."""
     engine = chosen_engine(settings.effort.engine)
     search = Search(iterations=settings.effort.iterations, seed=settings.seed)
     shortest = replace(weighed, deformation=0.0, distance=1.0)
     found = {}
-    for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)]):
+    for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)][
+            :2 if is_compared or settings.planner != "eikonal" else 1]):
         part = progress.part(0.5 * number, 0.5 * (number + 1))
         part(0.0, name)
         asked = PathProblem(problem.energy_field, problem.limits, cost.weights, problem.start,

@@ -55,7 +55,7 @@ def _trial(field: EnergyField, goal: Goal, settings: PlanSettings, number: int,
     start = field.rest
     try:
         start = random_start(field, goal, own, own.seed)
-        pair = plan_pair(field, start, goal, own, detour_from_tree=True, progress=progress)
+        pair = plan_pair(field, start, goal, own, is_compared=True, progress=progress)
     except NoPathError as error:
         return ComparedTrial(number, start, {}, {}, trouble=error.seen)
     paths = {name: resample(pair.compared[name], STEP) for name in COMPARED

@@ -35,11 +35,7 @@ from limber.planning.field.sampling import solve_branch
 from limber.planning.field.stored_states import States
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest, grasp_goal
 from limber.planning.goals.goal_kinds import goal_of
-from limber.planning.path_on_full_model import (
-    ResolvedPath,
-    resolve_path,
-    resolve_side_by_side,
-)
+from limber.planning.path_on_full_model import ResolvedPath, resolve_path
 from limber.planning.path_problem import UNPROVEN, BlockedError, start_of
 from limber.planning.plan_file import doubts_of, summary_of
 from limber.planning.planners.least_violation import LeastViolation, easiest_path
@@ -458,32 +454,26 @@ class _Rounds:
         """Return the plan on the full model, and keep the baseline there unless the plan is
         probably refused."""
         ahead(0.3, "both paths on the full model")
-        points = [pair.plan.points]
-        if pair.unbounded is None and self._lacks_baseline(pair):
-            points.append(pair.baseline.points)
-        plan, *other = self._on_full_model(points, pair, ahead.part(0.3, 0.95))
-        if other:
-            self.baseline, self.baseline_points = other[0], points[1]
-        return plan
+        if pair.unbounded is None:
+            self._with_baseline(pair, ahead.part(0.6, 0.95))
+        return self._on_full_model(pair.plan.points, pair, ahead.part(0.3, 0.6))
 
-    def _lacks_baseline(self, pair: PathPair) -> bool:
+    def _with_baseline(self, pair: PathPair, ahead: Progress) -> None:
         # The shortest path rarely changes with new samples: it is solved once.
-        return not (self.baseline_points is not None
-                    and np.array_equal(self.baseline_points, pair.baseline.points))
+        points = pair.baseline.points
+        if self.baseline_points is None or not np.array_equal(self.baseline_points, points):
+            self.baseline = self._on_full_model(points, pair, ahead)
+            self.baseline_points = points
 
-    def _on_full_model(self, paths: list[np.ndarray], pair: PathPair, ahead: Progress,
-                       ) -> list[ResolvedPath]:
-        # A refined path has points closer together, so that its chords follow the shell.
-        return resolve_side_by_side(
-            self.grasp_model, [resample(points, STEP) for points in paths], pair.approach,
-            self.workers, ahead)
+    def _on_full_model(self, points: np.ndarray, pair: PathPair, ahead: Progress) -> ResolvedPath:
+        # A refined path has points closer together, so that its chords follow the shell. Another
+        # process would take longer to begin than to solve it.
+        return resolve_path(self.grasp_model, resample(points, STEP), pair.approach, ahead)
 
     def _completed(self, pair: PathPair, ahead: Progress) -> None:
         """Add to a plan that holds what it lacks: a close bound, the baseline on the full model."""
         self.pair = with_bound(pair, ahead)
-        if self._lacks_baseline(pair):
-            self.baseline, = self._on_full_model([pair.baseline.points], pair, ahead)
-            self.baseline_points = pair.baseline.points
+        self._with_baseline(pair, ahead)
 
     def _broken(self, plan: ResolvedPath, is_near: bool, ahead: Progress) -> list[str]:
         """Return the limits that a plan breaks, at standstill, with other moduli, or in motion; the

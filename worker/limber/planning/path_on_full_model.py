@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import Command, ConvergenceError, Option
-from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.field.grasp_model import GraspModel, refusal
@@ -84,11 +83,3 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
     return ResolvedPath(
         States.of(grasp_model, good or before[-1:]), States.of(grasp_model, before),
         np.array(unsolved).reshape(-1, 3), tuple(reasons), is_whole)
-
-
-def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], approach: np.ndarray,
-                         workers: int | None = None, progress: Progress = SILENT,
-                         ) -> list[ResolvedPath]:
-    """Solve several paths with the same approach, each in its own process if cores allow."""
-    return run_tasks(resolve_path, [(grasp_model, path, approach) for path in paths],
-                     workers=workers, progress=progress, message="both paths on the full model")

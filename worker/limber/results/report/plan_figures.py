@@ -40,7 +40,7 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
                             "of the field that the planner used."),
         (paths_over_slice(field, plan, _tree_of(branch, name)),
          "Both paths over the energy field, in the plane that fits them best; white where the "
-         "branch was not sampled. The cross is the rest pose. Grey: the search tree of D-RRT*, "
+         "branch was not sampled. The cross is the rest pose. Grey: the search tree, "
          "projected onto that plane."),
     ]
     if moved := searched(plan.summary["convergence"]):
@@ -215,9 +215,9 @@ class _View:
 
 
 def _tree_of(branch: Branch, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return nodes [m] and parents of the tree of D-RRT*; None if it was not kept."""
-    file = f"plans/{name}-trees.csv"
-    return read_trees(branch.path(file)).get("D-RRT*") if branch.has(file) else None
+    """Return nodes [m] and parents of the planner's tree, else of RRT*'s; None if not kept."""
+    trees = read_trees(branch.path(file)) if branch.has(file := f"plans/{name}-trees.csv") else {}
+    return trees.get("D-RRT*", trees.get("RRT*"))
 
 
 def searched(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, np.ndarray]:

@@ -3,7 +3,6 @@
 import numpy as np
 
 from limber.core.errors import Command, InputError, Option, Text
-from limber.estimation.estimate_file import read_estimate
 from limber.mechanics.materials.materials import young_weights
 from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.constraints.limits import Limits
@@ -34,6 +33,8 @@ def estimated_uncertainty(branch: Branch, grasp_model: GraspModel) -> YoungUncer
     intervals of bending stiffness, as a plan uses the estimate's mesh, whose error of radius
     cancels with the modulus's, and the fit's correlations. Control points of one group share a
     modulus. InputError without interval."""
+    from limber.estimation.estimate_file import read_estimate
+
     if not branch.has("estimate.json"):
         return None
     found = read_estimate(branch.require("estimate.json", "estimate"))
