@@ -258,10 +258,10 @@ def doubtful_parts(skeleton: Skeleton) -> list[DoubtfulPart]:
     found: list[DoubtfulPart] = []
     for run, (members, own) in enumerate(
             zip(skeleton.runs(), skeleton.own_runs(), strict=True)):
-        there = skeleton.probability[own]
-        if there.min() < _LIKELY:
-            outer = own[np.argmax(there < _LIKELY):]
-            found.append(_part(skeleton, DoubtfulKind.unlikely, run, outer, float(there.min())))
+        # Nodes in gaps, or off by more than the radius, are doubted besides: the branch is there.
+        there = float(skeleton.probability[own].max())
+        if there < _LIKELY:
+            found.append(_part(skeleton, DoubtfulKind.unlikely, run, own, there))
         share = skeleton.radius_sigma / np.maximum(skeleton.radius, 1e-300)
         # Limited: points show more than wood has there, as a bunch of twigs or two limbs in one.
         for state, kind in ((UNRESOLVED, DoubtfulKind.unresolved),
