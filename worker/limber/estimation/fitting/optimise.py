@@ -129,10 +129,10 @@ class _Search:
     is tried again with more damping."""
 
     def __init__(self, objective: Objective, evaluation_limit: int, shortest: float):
-        self._objective, self._limit = objective, evaluation_limit
+        self._objective, self._limit, self._shortest = objective, evaluation_limit, shortest
         self._lower, self._upper = objective.space.bounds()
-        # Of the noise that there is: measurements may be better than stated.
-        self._shortest = shortest * np.clip(objective.variance**0.5, LEAST_NOISE, 1.0)
+        # Measurements may be better than stated.
+        self._noise = float(np.clip(objective.variance**0.5, LEAST_NOISE, 1.0))
 
     def inside(self, free: np.ndarray) -> np.ndarray:
         """The vector within the bounds."""
@@ -151,23 +151,23 @@ class _Search:
             slopes, residual = weight[:, None] * at.slopes, weight * at.residual
             full = self._step(at.free, slopes, residual, 0.0)
             length = float(np.linalg.norm(slopes @ full))
-            if length < self._shortest:
+            if length < self._shortest * self._noise:
                 return Fit(at, FitStatus.converged, "The next step is shorter than "
-                           f"{self._shortest:.2g} standard deviations.", full)
+                           f"{self._shortest * self._noise:.2g} standard deviations.", full)
             if self._objective.work.left <= 0:
                 return Fit(at, FitStatus.out_of_work, f"Its budget was spent {length:.2g} standard "
                            "deviations from where it was going.", full)
             step = self._step(at.free, slopes, residual, damping) if damping else full
             longest = float(np.abs(step[:self._objective.space.group_count]).max())
             step *= min(1.0, LONGEST_STEP / max(longest, 1e-12))
+            foreseen = 0.5 * float(residual @ residual - np.sum((residual + slopes @ step)**2))
+            # Too little is to be gained.
+            if damping > MOST_DAMPING or (damping and foreseen < max(
+                    ending * cost(at), UNSETTLED_FALL * self._noise**2)):
+                return Fit(at, FitStatus.converged, "No step descends.")
             tried = self._objective.evaluate(at.free + step, jacobian=True)
             fall = -np.inf if tried is None else cost(at) - cost(tried)
-            foreseen = 0.5 * float(residual @ residual - np.sum((residual + slopes @ step)**2))
             if tried is None or fall <= 0:
-                # Too little was to be gained.
-                if damping > MOST_DAMPING or (tried is not None and foreseen < max(
-                        ending * cost(at), UNSETTLED_FALL)):
-                    return Fit(at, FitStatus.converged, "No step descends.")
                 damping = max(FIRST_DAMPING, 8 * damping)
                 continue
             # Where a full step failed, the next one would too.
