@@ -256,8 +256,7 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
         # A fit that came out too thin or too thick is as unsure as the thinner one.
         thin = np.minimum(radius, first)
         errors = _of_runs(skeleton, evidence, thin)
-        known = _information(skeleton, evidence, own / trust - evidence.covariance[:, 3, 3]
-                             / first**2, measured, independent)
+        known = _information(skeleton, evidence, own / trust, measured, independent)
         posterior = _Posterior.of(Wood.of(skeleton, radius), bends, known, fitted,
                                   errors)
         radius = np.exp(posterior.mean[:, 3])
@@ -315,16 +314,18 @@ def point_spacing(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, n
     return np.sqrt(np.maximum(near**2 - noise**2, (0.5 * near)**2))
 
 
-def _information(skeleton: Skeleton, evidence: ShapeEvidence, local: np.ndarray,
+def _information(skeleton: Skeleton, evidence: ShapeEvidence, variance: np.ndarray,
                  measured: np.ndarray, share: np.ndarray) -> sparse.bsr_matrix:
-    """Information [4 n, 4 n] of the fits on nodes (x, y, z [m], ln radius). ``local`` is the
-    variance of ln radius beside the covariance, ``share`` that of an independent fit which a node
-    is. Nodes that are not ``measured`` hold their axis to a radius."""
+    """Information [4 n, 4 n] of the fits on nodes (x, y, z [m], ln radius). ``variance`` is that of
+    ln radius, ``share`` that of an independent fit which a node is. Nodes that are not ``measured``
+    hold their axis to a radius."""
     radius, count = skeleton.radius, skeleton.node_count
-    scale = np.ones((count, 4))
-    scale[:, 3] = 1 / radius
+    scale = np.column_stack([np.ones((count, 3)), 1 / radius])
     covariance = evidence.covariance * scale[:, :, None] * scale[:, None, :]
-    covariance[:, 3, 3] += local
+    # A radius surer than its fit says moves the axis as far, or information would be negative.
+    surer = np.minimum(variance / np.maximum(covariance[:, 3, 3], 1e-300), 1.0)[:, None]
+    covariance[:, [0, 1, 2, 3, 3, 3], [3, 3, 3, 0, 1, 2]] *= surer
+    covariance[:, 3, 3] = variance
     covariance[:, [0, 1, 2], [0, 1, 2]] += (1e-3 * radius[:, None])**2
     block = np.linalg.inv(covariance) * share[:, None, None]
     block[~measured] = 0.0
