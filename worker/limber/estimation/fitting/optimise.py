@@ -110,9 +110,10 @@ def gauss_newton(objective: Objective, start: np.ndarray, *,
 
 
 def own_weights(found: Evaluation, objective: Objective) -> np.ndarray:
-    """Weights of the rows: the noisier the measurements, the more the priors count, [r]."""
+    """Weights of the rows: the noisier the measurements, the more the priors count, [r]. Less than
+    stated they never do: small residuals do not show that what is alike in all frames is small."""
     weights, count = np.ones(len(found.residual)), objective.space.own_row_count
-    weights[len(weights) - count:] = objective.variance**0.5
+    weights[len(weights) - count:] = max(objective.variance, 1.0)**0.5
     return weights
 
 
