@@ -1,6 +1,7 @@
 """The rod that finds the states of a branch, and starts the full model from them."""
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,10 @@ from limber.planning.field import sampling
 from limber.planning.field.rod_kernels import BAND, assembled, known_at
 from limber.planning.field.sampling import sample_field
 from limber.stages.paths.energy import EnergySettings
+from limber.store import Branch
+from limber.store.loading import load_grasp_model
+
+EXAMPLES = Path(__file__).parents[2] / "blend_files"
 
 WAYS = np.array([[0.03, 0.0, -0.01], [0.0, -0.05, -0.02], [-0.04, 0.03, -0.03]])
 
@@ -172,7 +177,14 @@ def test_a_field_is_the_full_model_s_at_any_number_of_processes(monkeypatch):
 def test_another_shape_than_the_rod_s_is_refused(monkeypatch, small_model):
     """Where the full model comes to another shape, which one results depends on the path."""
     monkeypatch.setattr(sampling, "_OTHER_SHAPE", 0.0)
+    monkeypatch.setattr(sampling, "_OUTLYING", 0.0)
     sampled = sample_field(small_model, EnergySettings(samples=30), workers=1)
     assert len(sampled.samples.poses) == 1
     assert sampled.reasons == {sampling.TWO_SHAPES: len(sampled.samples.rejected_poses)}
     assert len(sampled.samples.rejected_poses) > 20
+
+
+def test_where_a_rod_is_off_everywhere_no_pose_is_in_another_shape():
+    """The paper's mature branch, whose moduli vary thirtyfold: 171 of 225 poses were refused."""
+    model = load_grasp_model(Branch.open(EXAMPLES / "mature"), gravity=True)
+    assert len(sample_field(model, EnergySettings(samples=60), workers=1).samples.poses) > 45

@@ -27,7 +27,7 @@ from limber.planning.field.energy_field import WHAT, EnergyField, as_before
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.rod import RodState
 from limber.planning.field.rod_kernels import known_at
-from limber.planning.field.sampling import grown, is_other_shape, solved_from
+from limber.planning.field.sampling import grown, other_shapes, solved_from
 from limber.planning.field.stored_states import States
 
 _SOLVED = 48  # poses that the full model solves again, evenly among all
@@ -66,8 +66,10 @@ def with_modulus(known: EnergyField, before: GraspModel, after: GraspModel, *,
                          progress.part(0.5, 1.0))
     samples = _corrected(known.samples.take(1 + both), before, [then[k] for k in both],
                          after, [now[k] for k in both])
-    good = [one for one in solved if not one.trouble and not is_other_shape(
-        after, one.state, samples.shape[asked[one.target], 3:])]
+    held = [one for one in solved if not one.trouble]
+    is_other = other_shapes(after, [one.state for one in held],
+                            [samples.shape[asked[one.target], 3:] for one in held])
+    good = [one for one, is_off in zip(held, is_other, strict=True) if not is_off]
     lost = np.concatenate([np.setdiff1d(np.arange(len(places)), both), np.setdiff1d(
         both[asked], [both[asked[one.target]] for one in good])]).astype(int)
     return as_before(known, replace(

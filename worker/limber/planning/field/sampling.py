@@ -211,6 +211,7 @@ _FEWEST_DIRECTIONS = 8
 _USUAL = 2048  # poses that show where the field is evaluated most
 _TAUT = 2.0  # times the median force
 _OTHER_SHAPE = 0.02  # fraction of the length by which the full model is in another shape
+_OUTLYING = 4.0  # the same, times what the rod is off in half of the poses
 _FEW = 400_000  # poses by tetrahedra that are solved before further processes would have started
 _SHARE_POSES = 30
 """Poses of one task; must not depend on the number of processes."""
@@ -262,20 +263,28 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
     solved = solved_from(grasp_model, asked, [*field.states[1:], *([None] * len(lost))],
                      workers, progress.part(0.3, 1.0))
     # In another shape than the rod: which results depends on the path.
-    troubles = [one.trouble or (TWO_SHAPES if one.target < len(field.states) - 1 and is_other_shape(
-        grasp_model, one.state, field.shapes[1 + one.target].ravel()) else None) for one in solved]
+    troubles = [one.trouble and str(one.trouble) for one in solved]
+    led = [k for k, one in enumerate(solved) if not one.trouble and (
+        one.target < len(field.states) - 1)]
+    for k in np.flatnonzero(other_shapes(grasp_model, [solved[k].state for k in led], [
+            field.shapes[1 + solved[k].target].ravel() for k in led])):
+        troubles[led[k]] = TWO_SHAPES
     good = (one.state for one, why in zip(solved, troubles, strict=True) if not why)
     samples = States.of(grasp_model, [grasp_model.rest], sloped=True).joined(*good)
     rejected = np.concatenate([asked[[why is not None for why in troubles]], field.bistable])
-    reasons = Counter([*(str(why) for why in troubles if why), *[TWO_SHAPES] * len(field.bistable)])
+    reasons = Counter([*filter(None, troubles), *[TWO_SHAPES] * len(field.bistable)])
     return Sampled(replace(samples, rejected_poses=np.pad(rejected, [(0, 0), (0, 3)])),
                    energy_surface, dict(sorted(reasons.items())), int((~slack).sum()))
 
 
-def is_other_shape(grasp_model: GraspModel, state: States, foretold: np.ndarray) -> bool:
-    """Return whether tip and targets of the one ``state`` are not where they were ``foretold``."""
-    off = np.abs(state.shape[0, 3:] - foretold).max()
-    return bool(off > _OTHER_SHAPE * grasp_model.reach.arc_length)
+def other_shapes(grasp_model: GraspModel, states: Sequence[States],
+                 foretold: Sequence[np.ndarray]) -> np.ndarray:
+    """Return in which ``states``, of a pose each, tip and targets are not where they were
+    ``foretold``, shape [n]. Where moduli vary much along the branch, a rod is off everywhere."""
+    off = np.array([np.abs(state.shape[0, 3:] - places).max()
+                    for state, places in zip(states, foretold, strict=True)])
+    usual = float(np.median(off)) if len(off) else 0.0
+    return off > max(_OTHER_SHAPE * grasp_model.reach.arc_length, _OUTLYING * usual)
 
 
 def _slack(forces: np.ndarray, walked: np.ndarray) -> np.ndarray:
