@@ -110,8 +110,9 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
                     Option("deflection"), ".")
             samples, rejected = field.samples, len(field.samples.rejected_poses)
             if rejected > 0.2 * self.samples:
+                why = [f"{n} {text}" for text, n in told.get("rejected_reasons", {}).items()]
                 progress.warn(f"{rejected} of {self.samples} poses were rejected "
-                              f"({told.get('rejected_reasons')}). Paths avoid them.")
+                              f"({', '.join(why)}). Paths avoid them.")
             field.write(stage.path("energy.npz"), {
                 "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
                 "rest_pose": samples.poses[0], "chart_base_m": grasp_model.reach.base,
